@@ -1,0 +1,13 @@
+//! Two worlds with lava in which chance is explicit.
+//!
+//! A step of every [`World`] has two halves. [`World::law`] answers with the nominal law P_t of what
+//! chance may decide once the protagonist has chosen its action; [`World::apply`] carries out one
+//! realised outcome o_t. Whoever wants to reweight chance (the antagonist of the game) stands
+//! between the two. The worlds know nothing of learning.
+
+pub mod law;
+pub mod random;
+pub mod world;
+
+pub use law::{FiniteLaw, GaussianLaw, Law};
+pub use world::{End, Step, World};

@@ -1,0 +1,33 @@
+//! Named streams of random numbers: everything random in a run follows from one seed.
+
+use rand::SeedableRng;
+pub use rand::rngs::ChaCha8Rng;
+
+/// What a stream is for. Streams of one seed never overlap.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Purpose {
+    /// Initial weights of the protagonist.
+    ProtagonistWeights,
+    /// Initial weights of the antagonist.
+    AntagonistWeights,
+    /// Actions drawn in training rollouts.
+    Actions,
+    /// Outcomes of chance drawn in training rollouts.
+    Outcomes,
+    /// Order of the samples in minibatches.
+    Minibatches,
+    /// Actions drawn in evaluation, per episode.
+    EvaluationActions,
+    /// Outcomes of chance drawn in evaluation, per episode.
+    EvaluationOutcomes,
+    /// Resampling of statistics.
+    Bootstrap,
+}
+
+/// The stream of `seed` for a purpose; `index` tells apart the streams of one purpose (for example
+/// one per episode) and lies below 2^56.
+pub fn stream(seed: u64, purpose: Purpose, index: u64) -> ChaCha8Rng {
+    let mut random = ChaCha8Rng::seed_from_u64(seed);
+    random.set_stream(((purpose as u64) << 56) | index);
+    random
+}

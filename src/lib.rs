@@ -1,0 +1,7 @@
+//! Risk-sensitive reinforcement learning by games, with exact yardsticks.
+//!
+//! A protagonist learns to reach a goal past lava. An antagonist reweights the probabilities of
+//! chance within a multiplicative budget eta over the whole trajectory. At equilibrium the
+//! protagonist maximises CVaR_alpha of its return at alpha = 1/eta (arXiv 2109.09470).
+
+pub mod game;
