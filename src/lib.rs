@@ -4,4 +4,8 @@
 //! chance within a multiplicative budget eta over the whole trajectory. At equilibrium the
 //! protagonist maximises CVaR_alpha of its return at alpha = 1/eta (arXiv 2109.09470).
 
+pub mod exact;
+pub mod experiment;
 pub mod game;
+pub mod learn;
+pub mod report;

@@ -5,9 +5,16 @@
 //! realised outcome o_t. Whoever wants to reweight chance (the antagonist of the game) stands
 //! between the two. The worlds know nothing of learning.
 
+pub mod error;
+pub mod grid;
 pub mod law;
+pub mod map;
+pub mod point;
 pub mod random;
 pub mod world;
 
+pub use error::ConfigError;
+pub use grid::{GridConfig, LavaGrid, Move};
 pub use law::{FiniteLaw, GaussianLaw, Law};
+pub use point::{Force, LavaPoint, PointConfig};
 pub use world::{End, Step, World};

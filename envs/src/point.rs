@@ -1,0 +1,253 @@
+//! `lava-point`: a disc that is pushed across a plane with lava, in metres and seconds.
+//!
+//! A control step of length tau goes
+//!
+//! 1. the action u is scaled onto the unit disc if it is longer; vbar = v + A u;
+//! 2. chance draws xi, nominally N(0, I); v = vbar + sigma xi;
+//! 3. Rapier integrates n substeps of tau/n, with walls and damping ([`physics`]);
+//! 4. in the first substep in which the disc touches lava the episode ends with `lava_reward`, in
+//!    which its centre gets inside the goal region with `goal_reward`; of two impacts in one substep
+//!    the earlier one counts, and lava if they coincide. Both tests are swept along the substep's
+//!    motion ([`geometry`]), so that no fast body jumps over a corner. Otherwise the reward is
+//!    `-step_cost`, and after T steps the episode ends.
+//!
+//! The state is position and velocity in f32, Rapier's precision; x counts to the right, y downward,
+//! both from the arena's corner. An ended episode stays where it ended: at the point of impact.
+
+pub mod config;
+pub mod geometry;
+pub mod physics;
+
+pub use config::{PointConfig, Rectangle};
+
+use crate::error::ConfigError;
+use crate::law::GaussianLaw;
+use crate::world::{End, Step, World};
+use geometry::Scene;
+use nalgebra::Vector2;
+use physics::{Body, Physics};
+use rapier2d::math::Vector;
+
+/// Speed that the observation maps onto 1 (m/s).
+pub const OBSERVED_SPEED: f64 = 4.0;
+
+/// The action: a push u, in units of the largest one. Longer vectors than 1 are allowed; the world
+/// scales them onto the unit disc.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Force(pub Vector2<f64>);
+
+impl Force {
+    /// The push that the world carries out, of length at most 1.
+    pub fn on_disc(self) -> Vector2<f64> {
+        let length = self.0.norm();
+        if length > 1.0 { self.0 / length } else { self.0 }
+    }
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+struct Clock {
+    time: u32,
+    ended: bool,
+}
+
+/// A batch of episodes of `lava-point`.
+pub struct LavaPoint {
+    config: PointConfig,
+    scene: Scene,
+    physics: Physics,
+    bodies: Vec<Body>,
+    clocks: Vec<Clock>,
+    /// Work space: the slots that still move in this control step.
+    moving: Vec<usize>,
+    /// Work space: where each of them was before the substep.
+    before: Vec<Vector>,
+}
+
+impl LavaPoint {
+    /// A batch of `episodes` slots, all in the initial state.
+    ///
+    /// # Errors
+    /// If a value of the configuration is out of range.
+    pub fn new(config: &PointConfig, episodes: usize) -> Result<Self, ConfigError> {
+        config.validate()?;
+        let start = Body { position: vector(config.start), velocity: Vector::ZERO };
+        Ok(LavaPoint {
+            scene: Scene::new(config),
+            physics: Physics::new(config, episodes),
+            bodies: vec![start; episodes],
+            clocks: vec![Clock { time: 0, ended: false }; episodes],
+            moving: Vec::with_capacity(episodes),
+            before: Vec::with_capacity(episodes),
+            config: config.clone(),
+        })
+    }
+
+    /// The same world with every substep of every body in Rapier, free flight included. Bit for bit
+    /// equal and slower; for tests and benchmarks.
+    ///
+    /// # Errors
+    /// If a value of the configuration is out of range.
+    pub fn by_rapier_alone(config: &PointConfig, episodes: usize) -> Result<Self, ConfigError> {
+        let mut world = LavaPoint::new(config, episodes)?;
+        world.physics.give_all_to_rapier();
+        Ok(world)
+    }
+
+    /// The constants of this world.
+    pub fn config(&self) -> &PointConfig {
+        &self.config
+    }
+
+    /// Velocity of the disc in m/s.
+    pub fn velocity(&self, slot: usize) -> [f64; 2] {
+        floats(self.bodies[slot].velocity)
+    }
+
+    /// Starts a new episode at time 0 from a given state (metres, m/s; rounded to f32) instead of the
+    /// initial one. For tests and for yardsticks that need other starts.
+    ///
+    /// # Panics
+    /// If the disc does not lie in the arena or a number is not finite.
+    pub fn place(&mut self, slot: usize, position: [f64; 2], velocity: [f64; 2]) {
+        let inside = (0..2).all(|axis| {
+            let margin = self.config.radius - 1e-4; // a disc at a wall has rounding errors
+            position[axis] >= margin && position[axis] <= self.config.arena[axis] - margin
+        });
+        assert!(inside, "a disc of radius {} at {position:?} leaves the arena", self.config.radius);
+        assert!(velocity.iter().all(|v| v.is_finite()), "the velocity {velocity:?} is not finite");
+        self.bodies[slot] = Body { position: vector(position), velocity: vector(velocity) };
+        self.clocks[slot] = Clock { time: 0, ended: false };
+    }
+
+    /// Mean velocity vbar = v + A u after the push, in m/s.
+    pub fn mean_velocity(&self, slot: usize, action: Force) -> Vector2<f64> {
+        Vector2::from(self.velocity(slot)) + self.config.acceleration * action.on_disc()
+    }
+
+    fn scaled_position(&self, slot: usize) -> [f32; 2] {
+        let [x, y] = self.position(slot);
+        let [width, height] = self.config.arena;
+        [(2.0 * x / width - 1.0) as f32, (2.0 * y / height - 1.0) as f32]
+    }
+}
+
+fn vector([x, y]: [f64; 2]) -> Vector {
+    Vector::new(x as f32, y as f32)
+}
+
+fn floats(vector: Vector) -> [f64; 2] {
+    [f64::from(vector.x), f64::from(vector.y)]
+}
+
+impl World for LavaPoint {
+    type Action = Force;
+    type Law = GaussianLaw;
+
+    /// Position, mapped from the arena onto [-1, 1]^2, and velocity in units of [`OBSERVED_SPEED`].
+    const OBSERVATION: usize = 4;
+    /// Position likewise, and the mean post-force velocity vbar likewise. The parameters of the law
+    /// are constants (xi is standard normal, sigma is the config's) and are therefore left out.
+    const SITUATION: usize = 4;
+
+    fn episodes(&self) -> usize {
+        self.bodies.len()
+    }
+
+    fn horizon(&self) -> u32 {
+        self.config.horizon
+    }
+
+    fn reset(&mut self, slot: usize) {
+        self.bodies[slot] = Body { position: vector(self.config.start), velocity: Vector::ZERO };
+        self.clocks[slot] = Clock { time: 0, ended: false };
+    }
+
+    fn time(&self, slot: usize) -> u32 {
+        self.clocks[slot].time
+    }
+
+    fn observe(&self, slot: usize, observation: &mut [f32]) {
+        let velocity = self.bodies[slot].velocity / OBSERVED_SPEED as f32;
+        observation[..2].copy_from_slice(&self.scaled_position(slot));
+        observation[2..].copy_from_slice(&velocity.to_array());
+    }
+
+    fn law(&self, _slot: usize, _action: Force) -> GaussianLaw {
+        GaussianLaw
+    }
+
+    fn situation(&self, slot: usize, action: Force, situation: &mut [f32]) {
+        let velocity = self.mean_velocity(slot, action) / OBSERVED_SPEED;
+        situation[..2].copy_from_slice(&self.scaled_position(slot));
+        situation[2..].copy_from_slice(&[velocity.x as f32, velocity.y as f32]);
+    }
+
+    /// Distance from the disc's surface to the lava rectangle in metres, 0 at contact.
+    fn clearance(&self, slot: usize) -> f64 {
+        self.scene.clearance(self.bodies[slot].position)
+    }
+
+    fn position(&self, slot: usize) -> [f64; 2] {
+        floats(self.bodies[slot].position)
+    }
+
+    /// # Panics
+    /// If an action or an outcome of a running episode is not finite.
+    fn apply(&mut self, actions: &[Force], outcomes: &[Vector2<f64>], steps: &mut [Step]) {
+        assert_eq!(actions.len(), self.bodies.len(), "one action per slot");
+        assert_eq!(outcomes.len(), self.bodies.len(), "one outcome per slot");
+        assert_eq!(steps.len(), self.bodies.len(), "one step per slot");
+        self.moving.clear();
+        for (slot, step) in steps.iter_mut().enumerate() {
+            *step = Step::IDLE;
+            if self.clocks[slot].ended {
+                continue;
+            }
+            let velocity =
+                self.mean_velocity(slot, actions[slot]) + self.config.noise * outcomes[slot];
+            assert!(
+                velocity.iter().all(|v| v.is_finite()),
+                "slot {slot}: {:?} with outcome {:?} is not finite",
+                actions[slot],
+                outcomes[slot],
+            );
+            self.bodies[slot].velocity = vector(velocity.into());
+            self.clocks[slot].time += 1;
+            step.reward = -self.config.step_cost;
+            self.moving.push(slot);
+        }
+
+        for _ in 0..self.config.substeps {
+            self.before.clear();
+            self.before.extend(self.moving.iter().map(|&slot| self.bodies[slot].position));
+            self.physics.substep(&mut self.bodies, &self.moving);
+
+            let mut kept = 0;
+            for index in 0..self.moving.len() {
+                let slot = self.moving[index];
+                let position = &mut self.bodies[slot].position;
+                if let Some((impact, end)) = self.scene.impact(self.before[index], *position) {
+                    *position = impact;
+                    self.clocks[slot].ended = true;
+                    let reward = match end {
+                        End::Goal => self.config.goal_reward,
+                        End::Lava => self.config.lava_reward,
+                        End::Timeout => unreachable!("a place in the arena is no time limit"),
+                    };
+                    steps[slot] = Step { reward, end: Some(end) };
+                } else {
+                    self.moving[kept] = slot;
+                    kept += 1;
+                }
+            }
+            self.moving.truncate(kept);
+        }
+
+        for &slot in &self.moving {
+            if self.clocks[slot].time == self.config.horizon {
+                self.clocks[slot].ended = true;
+                steps[slot].end = Some(End::Timeout);
+            }
+        }
+    }
+}

@@ -1,0 +1,70 @@
+//! Exact yardsticks: what the right answer is on a finite world, without sampling and without torch.
+//!
+//! | question | file |
+//! |---|---|
+//! | which MDPs, and what must their state remember | [`mdp`] |
+//! | what is the law of J under a policy, with or without an antagonist | [`law`], [`policy`] |
+//! | what is the best attainable CVaR, V*(eta) | [`optimum`] |
+//! | what is the worst antagonist of a policy | [`antagonist`] |
+//! | what would the budget-augmented programme report | [`chow`] |
+//! | how good can a policy without a clock be | [`stationary`] |
+//! | how far is a trained policy from the optimum | [`certificate`] |
+//! | all of it on the grid | [`grid`] |
+//!
+//! Symbols: budget eta >= 1, risk level alpha = 1/eta, return J, threshold w, time t, state s, outcome
+//! of chance o, perturbation delta_t(o). Rewards and returns are in the world's reward units.
+
+pub mod antagonist;
+pub mod certificate;
+pub mod chow;
+pub mod grid;
+pub mod law;
+pub mod mdp;
+pub mod optimum;
+pub mod policy;
+pub mod stationary;
+
+/// Why a yardstick cannot be computed.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+pub enum ExactError {
+    /// The risk level is out of range.
+    #[error("alpha must lie in (0, 1], got {0}")]
+    Alpha(f64),
+    /// The budget is out of range.
+    #[error("the budget eta must be a finite number of at least 1, got {0}")]
+    Eta(f64),
+    /// The MDP makes no sense.
+    #[error("not a valid MDP: {0}")]
+    Mdp(String),
+    /// The accumulated rewards, states and steps are too many.
+    #[error(
+        "the world is too large to be solved exactly: more than {} combinations of time, \
+         accumulated reward and state",
+        mdp::MAX_NODES
+    )]
+    TooLarge,
+    /// Action probabilities that are none.
+    #[error("the action probabilities {row:?} of state {state} are no law")]
+    Policy {
+        /// The state.
+        state: usize,
+        /// What was given.
+        row: Vec<f64>,
+    },
+    /// The exact worst-case antagonist exists for deterministic policies only.
+    #[error("the exact worst-case antagonist is defined for deterministic policies only")]
+    Stochastic,
+    /// The grid's configuration is out of range.
+    #[error(transparent)]
+    Config(#[from] lava_envs::ConfigError),
+}
+
+fn require_alpha(alpha: f64) -> Result<(), ExactError> {
+    // A NaN fails both comparisons.
+    if alpha > 0.0 && alpha <= 1.0 { Ok(()) } else { Err(ExactError::Alpha(alpha)) }
+}
+
+/// alpha = 1/eta.
+fn require_eta(eta: f64) -> Result<f64, ExactError> {
+    if eta >= 1.0 && eta.is_finite() { Ok(1.0 / eta) } else { Err(ExactError::Eta(eta)) }
+}

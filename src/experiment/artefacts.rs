@@ -1,0 +1,158 @@
+//! What a run leaves behind, and where.
+//!
+//! A run `ENV/eta-E/seed-N` owns one folder:
+//!
+//! | file | what |
+//! |---|---|
+//! | `config.toml` | the resolved configuration of the run |
+//! | `manifest.json` | [`Manifest`]: where the run comes from |
+//! | `progress.csv` | one line per update of a player |
+//! | `final.safetensors` | weights of both players at the end, never the best |
+//! | `evaluation.json` | [`Evaluation`]; written last, so that a run with it is finished |
+
+use crate::game::returns::ReturnLaw;
+use serde::{Deserialize, Serialize};
+use std::io::{self, Write};
+use std::path::Path;
+
+/// Version of the on-disk formats. A folder with another one is refused, never overwritten.
+pub const SCHEMA: u32 = 1;
+
+/// Where a run comes from: all that is needed to repeat it.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Manifest {
+    /// Version of the on-disk formats.
+    pub schema: u32,
+    /// `ENV/eta-E/seed-N`.
+    pub run: String,
+    /// Version of the program.
+    pub version: String,
+    /// Commit of the source, if built in a checkout; `+` marks local changes.
+    pub commit: Option<String>,
+    /// Version of libtorch.
+    pub libtorch: String,
+    /// Device of the networks.
+    pub device: String,
+    /// Model name of the processor.
+    pub cpu: String,
+    /// Wall-clock seconds of training.
+    pub seconds: f64,
+    /// Environment steps of training.
+    pub steps: u64,
+    /// Set when the run failed; says at which update, which player and which quantity.
+    pub failure: Option<String>,
+}
+
+/// How a protagonist picks its action.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Mode {
+    /// The mode of its policy.
+    Greedy,
+    /// A draw from its policy.
+    Sampled,
+}
+
+/// Who decides the law of chance.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Chance {
+    /// The nominal law.
+    Nominal,
+    /// The learned antagonist.
+    Antagonist,
+    /// The exact worst-case antagonist of the greedy protagonist.
+    Exact,
+}
+
+/// Episodes of one protagonist mode under one kind of chance.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Play {
+    /// How the protagonist picked its actions.
+    pub protagonist: Mode,
+    /// Who decided the law of chance.
+    pub chance: Chance,
+    /// Whether `law` is exact or of recorded episodes is told by its `episodes`.
+    pub law: ReturnLaw,
+    /// Mean over episodes of the least distance to lava; `None` where it was not recorded.
+    pub mean_clearance: Option<f64>,
+}
+
+/// The budget audit (paper Eq. 5) over recorded trajectories.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct Audit {
+    /// Trajectories looked at.
+    pub trajectories: u64,
+    /// max prod delta / eta over all trajectories; at most 1.
+    pub max_budget_use: f64,
+    /// max |E_P[delta_t] - 1| over all steps looked at.
+    pub max_normalisation_error: f64,
+    /// Steps or trajectories beyond tolerance.
+    pub violations: u64,
+    /// Mean return of the sampled protagonist against the antagonist.
+    pub antagonist_mean: f64,
+    /// Its standard error.
+    pub antagonist_standard_error: f64,
+    /// The same mean from nominal episodes weighted by prod delta.
+    pub weighted_nominal_mean: f64,
+    /// Its standard error.
+    pub weighted_nominal_standard_error: f64,
+}
+
+/// Exact certificates (grid).
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct Certificate {
+    /// V*(eta): the optimal CVaR_{1/eta}.
+    pub optimum: f64,
+    /// V*(eta) - CVaR_{1/eta} of the greedy policy.
+    pub regret: f64,
+    /// Value of the greedy protagonist under the learned antagonist minus its CVaR_{1/eta}.
+    pub antagonist_gap: f64,
+    /// Standard error of `antagonist_gap`; 0 where that is exact.
+    pub antagonist_gap_standard_error: f64,
+}
+
+/// What the evaluation protocol found of a finished run.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Evaluation {
+    /// Version of the on-disk formats.
+    pub schema: u32,
+    /// Name of the world.
+    pub env: String,
+    /// Budget eta.
+    pub eta: f64,
+    /// Seed.
+    pub seed: u64,
+    /// Environment steps of training.
+    pub steps: u64,
+    /// Wall-clock seconds of training.
+    pub seconds: f64,
+    /// All plays: greedy and sampled, nominal and (eta > 1) antagonist.
+    pub plays: Vec<Play>,
+    /// The budget audit; `None` at eta = 1.
+    pub audit: Option<Audit>,
+    /// Certificates where the world has a yardstick.
+    pub certificate: Option<Certificate>,
+}
+
+impl Evaluation {
+    /// The play of this kind.
+    pub fn play(&self, protagonist: Mode, chance: Chance) -> Option<&Play> {
+        self.plays.iter().find(|play| play.protagonist == protagonist && play.chance == chance)
+    }
+}
+
+/// Writes a file in one piece: a reader sees all of it or none.
+///
+/// # Errors
+/// If the folder or the disk refuses.
+pub fn write_in_place(path: &Path, bytes: &[u8]) -> io::Result<()> {
+    let mut file = tempfile::Builder::new();
+    file.prefix(".part-");
+    #[cfg(unix)] // temporary files are private by default, artefacts are not
+    file.permissions(std::os::unix::fs::PermissionsExt::from_mode(0o666));
+    let mut file = file.tempfile_in(path.parent().unwrap_or(Path::new(".")))?;
+    file.write_all(bytes)?;
+    file.persist(path)?;
+    Ok(())
+}

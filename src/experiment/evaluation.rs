@@ -1,0 +1,356 @@
+//! The evaluation protocol of a finished run (the final weights, never the best).
+//!
+//! Greedy and sampled protagonist, under nominal chance and under its antagonist. On the grid the
+//! laws of the return under nominal chance are exact, computed from the weights; all others are of
+//! recorded episodes, on streams that all runs share. Three numbers are never conflated: the game
+//! value under the learned antagonist, the CVaR of the sampled policy, the CVaR of the greedy policy.
+
+use super::artefacts::{Audit, Certificate, Chance, Mode, Play};
+use super::config::{RunConfig, WorldConfig};
+use super::run::{RunError, load};
+use crate::exact::antagonist::WorstCase;
+use crate::exact::grid::ExactGrid;
+use crate::exact::policy::Policy;
+use crate::learn::arena::Arena;
+use crate::learn::contest::{self, Choosing, Opponent};
+use crate::learn::head::CategoricalPolicy;
+use crate::learn::pair::Pair;
+use crate::learn::play::{self, Played};
+use lava_envs::law::{FiniteLaw, MOVES, sample_index};
+use lava_envs::random::ChaCha8Rng;
+use lava_envs::{ConfigError, GridConfig, LavaGrid, LavaPoint, PointConfig, World};
+use std::path::Path;
+
+/// A world that can be built from constants and may have an exact yardstick.
+pub trait Yardstick: Arena + Sized {
+    /// Its constants.
+    type Constants;
+
+    /// A batch of the world.
+    ///
+    /// # Errors
+    /// If a constant is out of range.
+    fn build(constants: &Self::Constants, episodes: usize) -> Result<Self, ConfigError>;
+
+    /// Replaces laws of recorded episodes by exact ones where they can be had, and certifies.
+    ///
+    /// # Errors
+    /// If the world cannot be solved.
+    fn certify(
+        constants: &Self::Constants,
+        run: &RunConfig,
+        pair: &Pair<Self>,
+        plays: &mut [Play],
+    ) -> Result<Option<Certificate>, RunError>;
+
+    /// Plays against the exact worst-case antagonist of the greedy protagonist.
+    ///
+    /// # Errors
+    /// If there is none for this world.
+    fn play_exact(
+        constants: &Self::Constants,
+        run: &RunConfig,
+        pair: &Pair<Self>,
+    ) -> Result<Played, RunError>;
+}
+
+/// Slack of the audit: rounding of forty factors, and of the normalisation.
+const TOLERANCE: f64 = 1e-6;
+
+/// All plays of the protocol, the budget audit and the certificate.
+///
+/// # Errors
+/// If the world refuses its constants, cannot be solved, or the budget audit finds a violation.
+pub fn protocol<W: Yardstick>(
+    run: &RunConfig,
+    constants: &W::Constants,
+    pair: &Pair<W>,
+) -> Result<(Vec<Play>, Option<Audit>, Option<Certificate>), RunError> {
+    let antagonist = pair.antagonist.is_some();
+    // Nominal episodes of the sampled protagonist also carry the antagonist's ratios, for the audit.
+    let nominal = if antagonist { contest::Chance::Shadowed } else { contest::Chance::Nominal };
+    let mut plays = Vec::new();
+    let mut played = |mode, chance, kind| -> Result<Played, RunError> {
+        let episodes = play_episodes(run, constants, pair, mode, chance)?;
+        plays.push(to_play(mode, kind, &episodes));
+        Ok(episodes)
+    };
+    played(Mode::Greedy, contest::Chance::Nominal, Chance::Nominal)?;
+    let weighted = played(Mode::Sampled, nominal, Chance::Nominal)?;
+    let mut audit = None;
+    if antagonist {
+        let greedy = played(Mode::Greedy, contest::Chance::Antagonist, Chance::Antagonist)?;
+        let sampled = played(Mode::Sampled, contest::Chance::Antagonist, Chance::Antagonist)?;
+        audit = Some(budget_audit(run, &[&greedy, &sampled, &weighted])?);
+    }
+    let certificate = W::certify(constants, run, pair, &mut plays)?;
+    Ok((plays, audit, certificate))
+}
+
+fn play_episodes<W: Yardstick>(
+    run: &RunConfig,
+    constants: &W::Constants,
+    pair: &Pair<W>,
+    mode: Mode,
+    chance: contest::Chance<'_, W>,
+) -> Result<Played, RunError> {
+    let slots = run.evaluation.parallel_episodes.min(run.evaluation.episodes as usize);
+    let world = W::build(constants, slots)?;
+    let choosing = match mode {
+        Mode::Greedy => Choosing::Greedy,
+        Mode::Sampled => Choosing::Sampled,
+    };
+    let setting = play::Play {
+        choosing,
+        chance,
+        eta: run.eta,
+        gamma: run.gamma,
+        episodes: run.evaluation.episodes,
+        seed: run.evaluation.seed,
+    };
+    Ok(play::play(world, pair, &setting))
+}
+
+fn to_play(protagonist: Mode, chance: Chance, played: &Played) -> Play {
+    Play { protagonist, chance, law: played.law(), mean_clearance: played.mean_clearance() }
+}
+
+/// The budget audit: `[greedy, sampled]` episodes under the antagonist and the sampled protagonist's
+/// nominal episodes with the antagonist's ratios.
+fn budget_audit(
+    run: &RunConfig,
+    [greedy, sampled, weighted]: &[&Played; 3],
+) -> Result<Audit, RunError> {
+    let all = [greedy, sampled, weighted];
+    let uses = || {
+        all.iter().flat_map(|played| &played.episodes).map(|e| e.likelihood_ratio / run.eta.get())
+    };
+    let max_budget_use = uses().fold(0.0, f64::max);
+    let max_normalisation_error =
+        all.iter().map(|played| played.normalisation_error).fold(0.0, f64::max);
+    let violations = uses().filter(|&used| used > 1.0 + TOLERANCE).count() as u64
+        + u64::from(max_normalisation_error > TOLERANCE);
+    if violations > 0 {
+        return Err(RunError::Budget {
+            use_of_budget: max_budget_use,
+            normalisation_error: max_normalisation_error,
+        });
+    }
+    let (antagonist_mean, antagonist_standard_error) =
+        mean(sampled.episodes.iter().map(|e| e.atom.value));
+    let (weighted_nominal_mean, weighted_nominal_standard_error) =
+        mean(weighted.episodes.iter().map(|e| e.likelihood_ratio * e.atom.value));
+    Ok(Audit {
+        trajectories: all.iter().map(|played| played.episodes.len() as u64).sum(),
+        max_budget_use,
+        max_normalisation_error,
+        violations,
+        antagonist_mean,
+        antagonist_standard_error,
+        weighted_nominal_mean,
+        weighted_nominal_standard_error,
+    })
+}
+
+/// Mean and its standard error.
+fn mean(values: impl Iterator<Item = f64> + Clone) -> (f64, f64) {
+    let count = values.clone().count() as f64;
+    let mean = values.clone().sum::<f64>() / count;
+    let variance = values.map(|value| (value - mean).powi(2)).sum::<f64>() / (count - 1.0).max(1.0);
+    (mean, (variance / count).sqrt())
+}
+
+/// What to play with a finished run.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Request {
+    /// Who decides the law of chance.
+    pub chance: Chance,
+    /// Episodes of each play, if not those of the run's configuration.
+    pub episodes: Option<u64>,
+    /// Seed of the streams, if not that of the run's configuration.
+    pub seed: Option<u64>,
+}
+
+/// Plays the greedy and the sampled protagonist of the finished run in `folder`; against the exact
+/// antagonist, which is that of the greedy protagonist, this one alone. Writes nothing.
+///
+/// # Errors
+/// If the folder holds no finished run or the request makes no sense for it.
+pub fn evaluate_run(folder: &Path, request: &Request) -> Result<Vec<Play>, RunError> {
+    tch::set_num_threads(1);
+    let mut run = RunConfig::load(&folder.join("config.toml")).map_err(|error| {
+        RunError::file(&folder.join("config.toml"))(std::io::Error::other(error))
+    })?;
+    run.evaluation.episodes = request.episodes.unwrap_or(run.evaluation.episodes);
+    run.evaluation.seed = request.seed.unwrap_or(run.evaluation.seed);
+    match &run.env {
+        WorldConfig::LavaGrid(constants) => {
+            answer::<LavaGrid>(&run, constants, folder, request.chance)
+        }
+        WorldConfig::LavaPoint(constants) => {
+            answer::<LavaPoint>(&run, constants, folder, request.chance)
+        }
+    }
+}
+
+fn answer<W: Yardstick>(
+    run: &RunConfig,
+    constants: &W::Constants,
+    folder: &Path,
+    chance: Chance,
+) -> Result<Vec<Play>, RunError> {
+    let pair = load::<W>(run, folder)?;
+    if chance == Chance::Exact {
+        let played = W::play_exact(constants, run, &pair)?;
+        return Ok(vec![to_play(Mode::Greedy, chance, &played)]);
+    }
+    if chance == Chance::Antagonist && pair.antagonist.is_none() {
+        return Err(RunError::NoOpponent(
+            "a run at eta = 1 has no learned antagonist; use --antagonist nominal",
+        ));
+    }
+    [Mode::Greedy, Mode::Sampled]
+        .into_iter()
+        .map(|mode| {
+            let kind = match chance {
+                Chance::Antagonist => contest::Chance::Antagonist,
+                Chance::Nominal | Chance::Exact => contest::Chance::Nominal,
+            };
+            Ok(to_play(mode, chance, &play_episodes(run, constants, &pair, mode, kind)?))
+        })
+        .collect()
+}
+
+impl Yardstick for LavaGrid {
+    type Constants = GridConfig;
+
+    fn build(constants: &GridConfig, episodes: usize) -> Result<Self, ConfigError> {
+        LavaGrid::new(constants, episodes)
+    }
+
+    fn certify(
+        constants: &GridConfig,
+        run: &RunConfig,
+        pair: &Pair<Self>,
+        plays: &mut [Play],
+    ) -> Result<Option<Certificate>, RunError> {
+        let exact = ExactGrid::new(constants, run.gamma)?;
+        let optimum = exact.optimum(run.eta.get())?;
+        let sampled = policy_of(&exact, constants, pair)?;
+        let found = exact.certificate(&optimum, &sampled, run.eta.get())?;
+        // At eta = 1 there is no antagonist, and no gap.
+        let mut value = (found.greedy.cvar, 0.0);
+        for play in plays {
+            match (play.protagonist, play.chance) {
+                (Mode::Greedy, Chance::Nominal) => play.law = found.greedy_law.clone(),
+                (Mode::Sampled, Chance::Nominal) => play.law = found.sampled_law.clone(),
+                (Mode::Greedy, Chance::Antagonist) => {
+                    value = (play.law.mean(), play.law.mean_standard_error());
+                }
+                _ => {}
+            }
+        }
+        Ok(Some(Certificate {
+            optimum: found.optimal_cvar,
+            regret: found.regret,
+            antagonist_gap: found.antagonist_gap(value.0),
+            antagonist_gap_standard_error: value.1,
+        }))
+    }
+
+    fn play_exact(
+        constants: &GridConfig,
+        run: &RunConfig,
+        pair: &Pair<Self>,
+    ) -> Result<Played, RunError> {
+        let exact = ExactGrid::new(constants, run.gamma)?;
+        let greedy = policy_of(&exact, constants, pair)?.greedy(exact.mdp());
+        let worst = ExactOpponent {
+            exact: &exact,
+            greedy: &greedy,
+            worst: exact.worst_case(&greedy, run.eta.get())?,
+        };
+        play_episodes(run, constants, pair, Mode::Greedy, contest::Chance::Opponent(&worst))
+    }
+}
+
+/// The sampled policy of a trained protagonist, by time where it is time-aware.
+fn policy_of(
+    exact: &ExactGrid,
+    constants: &GridConfig,
+    pair: &Pair<LavaGrid>,
+) -> Result<Policy, RunError> {
+    let row = pair.views.protagonist_inputs::<LavaGrid>() + 1;
+    let mut world = LavaGrid::new(constants, 1)?;
+    let (cells, horizon) = (world.cells(), world.horizon());
+    let (mut inputs, mut outputs) = (vec![0.0; row * cells], Vec::new());
+    let mut at_time = |time: u32| -> Vec<[f64; MOVES]> {
+        for (cell, row) in inputs.chunks_exact_mut(row).enumerate() {
+            world.place(0, cell, time);
+            pair.views.protagonist(&world, 0, row);
+        }
+        pair.protagonist.network.act(&inputs, &mut outputs);
+        let logits = outputs.as_chunks::<MOVES>().0;
+        logits.iter().map(|l| CategoricalPolicy::probabilities(&l.map(f64::from))).collect()
+    };
+    if pair.views.protagonist_sees_time() {
+        let tables: Vec<_> = (0..horizon).map(at_time).collect();
+        Ok(exact.timed_policy(|time, cell| tables[time as usize][cell])?)
+    } else {
+        let table = at_time(0);
+        Ok(exact.stationary_policy(|cell| table[cell])?)
+    }
+}
+
+/// The exact worst-case antagonist of the greedy protagonist, as an opponent.
+struct ExactOpponent<'a> {
+    exact: &'a ExactGrid,
+    greedy: &'a Policy,
+    worst: WorstCase<'a>,
+}
+
+impl Opponent<LavaGrid> for ExactOpponent<'_> {
+    fn draw(
+        &self,
+        world: &LavaGrid,
+        slot: usize,
+        law: &FiniteLaw,
+        random: &mut ChaCha8Rng,
+    ) -> (usize, f64) {
+        if world.time(slot) >= world.horizon() || world.is_over(slot) {
+            return (0, 1.0); // an idle slot
+        }
+        let node = self.exact.node(world.time(slot), world.state(slot));
+        let action = self.greedy.action(self.exact.mdp(), node);
+        let ratios: [f64; MOVES] =
+            std::array::from_fn(|outcome| self.worst.delta(node, action, outcome));
+        let perturbed: [f64; MOVES] =
+            std::array::from_fn(|outcome| law.probabilities[outcome] * ratios[outcome]);
+        let outcome = sample_index(&perturbed, random);
+        (outcome, ratios[outcome])
+    }
+}
+
+impl Yardstick for LavaPoint {
+    type Constants = PointConfig;
+
+    fn build(constants: &PointConfig, episodes: usize) -> Result<Self, ConfigError> {
+        LavaPoint::new(constants, episodes)
+    }
+
+    fn certify(
+        _: &PointConfig,
+        _: &RunConfig,
+        _: &Pair<Self>,
+        _: &mut [Play],
+    ) -> Result<Option<Certificate>, RunError> {
+        Ok(None)
+    }
+
+    fn play_exact(_: &PointConfig, _: &RunConfig, _: &Pair<Self>) -> Result<Played, RunError> {
+        Err(RunError::NoOpponent(
+            "the exact worst-case antagonist is known on lava-grid alone; \
+             use --antagonist learned or nominal",
+        ))
+    }
+}

@@ -1,0 +1,17 @@
+//! Experiments: configuration -> plan of runs -> workers -> artefacts.
+//!
+//! | question | module |
+//! |---|---|
+//! | which options are there, and what may they be | [`config`] |
+//! | which runs does a configuration mean | [`plan`] |
+//! | how are they carried out, many at a time | [`runner`] |
+//! | what does a run leave behind | [`artefacts`] |
+
+pub mod artefacts;
+pub mod config;
+#[cfg(feature = "torch")]
+pub mod evaluation;
+pub mod plan;
+#[cfg(feature = "torch")]
+pub mod run;
+pub mod runner;

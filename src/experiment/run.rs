@@ -1,0 +1,250 @@
+//! One run, from its configuration to its artefacts: train, keep the weights, evaluate.
+
+use super::artefacts::{Evaluation, Manifest, SCHEMA, write_in_place};
+use super::config::{Device, RunConfig, WorldConfig};
+use super::evaluation::{self, Yardstick};
+use super::runner::Tick;
+use crate::exact::ExactError;
+use crate::learn::arena::Arena;
+use crate::learn::pair::Pair;
+use crate::learn::train::{Game, Progress, TrainError, train};
+use crate::learn::weights::{self, WeightsError};
+use lava_envs::{LavaGrid, LavaPoint};
+use std::collections::HashMap;
+use std::fs::File;
+use std::io::{self, BufWriter, Write};
+use std::path::Path;
+use std::time::Instant;
+
+/// Why a run failed.
+#[derive(Debug, thiserror::Error)]
+pub enum RunError {
+    /// Training stopped.
+    #[error(transparent)]
+    Train(#[from] TrainError),
+    /// The world refuses its constants.
+    #[error(transparent)]
+    World(#[from] lava_envs::ConfigError),
+    /// A yardstick refuses the world.
+    #[error(transparent)]
+    Exact(#[from] ExactError),
+    /// The weights are not those of the run.
+    #[error("final.safetensors does not fit the run: {0}")]
+    Weights(#[from] WeightsError),
+    /// A file could not be read or written.
+    #[error("{path}: {source}")]
+    File {
+        /// The file.
+        path: String,
+        /// What the system says.
+        source: io::Error,
+    },
+    /// There is no such antagonist.
+    #[error("{0}")]
+    NoOpponent(&'static str),
+    /// The antagonist broke its budget: an error of this program.
+    #[error(
+        "the antagonist broke its budget: prod delta / eta reached {use_of_budget}, \
+         |E[delta] - 1| reached {normalisation_error}; please report this with the run's config.toml"
+    )]
+    Budget {
+        /// max prod delta / eta.
+        use_of_budget: f64,
+        /// max |E[delta] - 1|.
+        normalisation_error: f64,
+    },
+}
+
+impl RunError {
+    /// An error about a file of the run.
+    pub fn file(path: &Path) -> impl FnOnce(io::Error) -> RunError + '_ {
+        move |source| RunError::File { path: path.display().to_string(), source }
+    }
+}
+
+/// Carries out the run and leaves its artefacts in `folder`, `evaluation.json` last.
+///
+/// # Errors
+/// If training fails or an artefact cannot be written.
+pub fn execute(
+    run: &RunConfig,
+    folder: &Path,
+    report: &mut dyn FnMut(Tick),
+) -> Result<(), RunError> {
+    tch::set_num_threads(1);
+    match &run.env {
+        WorldConfig::LavaGrid(constants) => carry_out::<LavaGrid>(run, constants, folder, report),
+        WorldConfig::LavaPoint(constants) => carry_out::<LavaPoint>(run, constants, folder, report),
+    }
+}
+
+fn carry_out<W: Yardstick>(
+    run: &RunConfig,
+    constants: &W::Constants,
+    folder: &Path,
+    report: &mut dyn FnMut(Tick),
+) -> Result<(), RunError> {
+    let world = W::build(constants, run.train.parallel_episodes)?;
+    let path = folder.join("progress.csv");
+    let mut progress = ProgressFile::create(&path).map_err(RunError::file(&path))?;
+    let game = Game {
+        eta: run.eta,
+        gamma: run.gamma,
+        seed: run.seed,
+        device: device(run.device),
+        options: &run.train,
+    };
+    let start = Instant::now();
+    let mut written = Ok(());
+    let mut last = Tick { steps: 0, mean_return: f64::NAN };
+    let trained = train::<W>(world, &game, |of| {
+        if written.is_ok() {
+            written = progress.add(of, start.elapsed().as_secs_f64());
+        }
+        last = Tick { steps: of.steps, mean_return: of.mean_return };
+        report(last);
+    });
+    let seconds = start.elapsed().as_secs_f64();
+    written.and_then(|()| progress.finish()).map_err(RunError::file(&path))?;
+
+    let mut manifest = manifest(run, seconds, last.steps);
+    manifest.failure = trained.as_ref().err().map(ToString::to_string);
+    write_json(&folder.join("manifest.json"), &manifest)?;
+    let pair = trained?;
+
+    let path = folder.join("final.safetensors");
+    let metadata = HashMap::from([
+        ("schema".to_owned(), SCHEMA.to_string()),
+        ("run".to_owned(), manifest.run),
+        ("steps".to_owned(), last.steps.to_string()),
+    ]);
+    write_in_place(&path, &weights::to_bytes(&pair, metadata)?).map_err(RunError::file(&path))?;
+
+    let (plays, audit, certificate) = evaluation::protocol(run, constants, &pair)?;
+    let evaluation = Evaluation {
+        schema: SCHEMA,
+        env: run.env.name().to_string(),
+        eta: run.eta.get(),
+        seed: run.seed,
+        steps: last.steps,
+        seconds,
+        plays,
+        audit,
+        certificate,
+    };
+    write_json(&folder.join("evaluation.json"), &evaluation)
+}
+
+/// The trained pair of a finished run.
+///
+/// # Errors
+/// If the weights cannot be read or are not of this run.
+pub fn load<W: Arena>(run: &RunConfig, folder: &Path) -> Result<Pair<W>, RunError> {
+    let path = folder.join("final.safetensors");
+    let bytes = std::fs::read(&path).map_err(RunError::file(&path))?;
+    let device = device(run.device);
+    let mut pair = Pair::<W>::new(&run.train, run.eta, run.seed, device);
+    weights::load(&mut pair, &bytes, device)?;
+    Ok(pair)
+}
+
+fn device(device: Device) -> tch::Device {
+    match device {
+        Device::Cpu => tch::Device::Cpu,
+        Device::Cuda(number) => tch::Device::Cuda(number),
+    }
+}
+
+fn manifest(run: &RunConfig, seconds: f64, steps: u64) -> Manifest {
+    Manifest {
+        schema: SCHEMA,
+        run: run.id().to_string(),
+        version: env!("CARGO_PKG_VERSION").to_owned(),
+        commit: option_env!("CVAR_GAME_COMMIT").map(str::to_owned),
+        libtorch: libtorch_version(),
+        device: run.device.to_string(),
+        cpu: cpu(),
+        seconds,
+        steps,
+        failure: None,
+    }
+}
+
+/// The version of libtorch that tch is made for; its build refuses any other.
+fn libtorch_version() -> String {
+    "2.13.0".to_owned()
+}
+
+/// Model name of the processor, where the system tells.
+fn cpu() -> String {
+    let text = std::fs::read_to_string("/proc/cpuinfo").unwrap_or_default();
+    let model = text.lines().find_map(|line| line.strip_prefix("model name"));
+    model.map_or("unknown", |name| name.trim_start_matches([' ', '\t', ':'])).to_owned()
+}
+
+fn write_json(path: &Path, value: &impl serde::Serialize) -> Result<(), RunError> {
+    let mut text = serde_json::to_string_pretty(value)
+        .map_err(|error| RunError::file(path)(io::Error::other(error)))?;
+    text.push('\n');
+    write_in_place(path, text.as_bytes()).map_err(RunError::file(path))
+}
+
+/// `progress.csv`: a line per update. `seconds` is the only column that differs between two runs of
+/// one seed.
+struct ProgressFile(csv::Writer<BufWriter<File>>);
+
+impl ProgressFile {
+    const COLUMNS: [&'static str; 18] = [
+        "update",
+        "steps",
+        "player",
+        "budget",
+        "mean_return",
+        "goal",
+        "lava",
+        "learning_rate",
+        "policy_loss",
+        "value_loss",
+        "entropy",
+        "approx_kl",
+        "clip_fraction",
+        "gradient_norm",
+        "explained_variance",
+        "budget_use",
+        "steps_per_second",
+        "seconds",
+    ];
+
+    fn create(path: &Path) -> io::Result<Self> {
+        let mut writer = csv::Writer::from_writer(BufWriter::new(File::create(path)?));
+        writer.write_record(Self::COLUMNS)?;
+        Ok(ProgressFile(writer))
+    }
+
+    fn add(&mut self, of: &Progress, seconds: f64) -> io::Result<()> {
+        let losses = &of.losses;
+        let numbers = [
+            of.budget,
+            of.mean_return,
+            of.goal,
+            of.lava,
+            of.learning_rate,
+            losses.policy_loss,
+            losses.value_loss,
+            losses.entropy,
+            losses.approx_kl,
+            losses.clip_fraction,
+            losses.gradient_norm,
+            losses.explained_variance,
+            of.budget_use,
+        ];
+        let head = [of.update.to_string(), of.steps.to_string(), of.role.to_string()];
+        let timing = [format!("{:.0}", of.steps as f64 / seconds), format!("{seconds:.3}")];
+        let record = head.into_iter().chain(numbers.map(|x| format!("{x:.6}"))).chain(timing);
+        Ok(self.0.write_record(record)?)
+    }
+
+    fn finish(self) -> io::Result<()> {
+        self.0.into_inner().map_err(|error| io::Error::other(error.to_string()))?.flush()
+    }
+}

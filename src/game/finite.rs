@@ -1,0 +1,126 @@
+//! The finite family (grid): `w = softmax(logits)`, `delta^0_i = w_i / sum_j p_j w_j`,
+//! `M = max_i delta^0_i`, followed by identity mixing.
+
+use crate::game::budget::{Budget, Mixing};
+use crate::game::perturbation::{Family, Perturbation};
+use lava_envs::law::{FiniteLaw, MOVES, sample_index};
+use rand::Rng;
+
+/// The finite family; its parameters are the logits.
+#[derive(Debug, Clone, Copy, Default)]
+pub struct FiniteFamily;
+
+/// An admissible perturbation of a finite law.
+#[derive(Debug, Clone)]
+pub struct FinitePerturbation {
+    nominal: [f64; MOVES],
+    /// log delta^0; of no meaning where the nominal probability is 0.
+    log_base: [f64; MOVES],
+    /// The outcome where delta^0 attains M.
+    top: usize,
+    mixing: Mixing,
+    /// delta.
+    ratio: [f64; MOVES],
+    /// P delta.
+    perturbed: [f64; MOVES],
+}
+
+impl Family for FiniteFamily {
+    type Law = FiniteLaw;
+    type Perturbation = FinitePerturbation;
+    const PARAMETERS: usize = MOVES;
+
+    fn perturbation(
+        &self,
+        parameters: &[f64],
+        law: &FiniteLaw,
+        budget: Budget,
+    ) -> FinitePerturbation {
+        let nominal = law.probabilities;
+        // The softmax's own normaliser cancels in delta^0. Outcomes that cannot happen have no say
+        // in M: their ratio multiplies nothing.
+        let mut top = usize::MAX;
+        for i in 0..MOVES {
+            if nominal[i] > 0.0 && (top == usize::MAX || parameters[i] > parameters[top]) {
+                top = i;
+            }
+        }
+        let highest = parameters[top];
+        let mut sum = 0.0;
+        for i in 0..MOVES {
+            if nominal[i] > 0.0 {
+                sum += nominal[i] * (parameters[i] - highest).exp();
+            }
+        }
+        let log_sum = sum.ln();
+        let log_base = std::array::from_fn(|i| {
+            if nominal[i] > 0.0 { parameters[i] - highest - log_sum } else { 0.0 }
+        });
+        let mixing = budget.mix(log_base[top]);
+        let ratio = std::array::from_fn(|i| mixing.likelihood_ratio(log_base[i]));
+        let perturbed = std::array::from_fn(|i| nominal[i] * ratio[i]);
+        FinitePerturbation { nominal, log_base, top, mixing, ratio, perturbed }
+    }
+}
+
+impl FinitePerturbation {
+    /// The perturbed probabilities P_t(o) delta_t(o).
+    pub fn probabilities(&self) -> &[f64; MOVES] {
+        &self.perturbed
+    }
+
+    /// Adds `weight * d delta_i / d logits` to the gradient. With q^0 = P delta^0:
+    /// dlog delta^0_i / d logit_k = [i = k] - q^0_k, and the same at the top for log M.
+    fn add_ratio_gradient(&self, i: usize, weight: f64, gradient: &mut [f64]) {
+        let (by_base, by_supremum) = self.mixing.derivatives(self.log_base[i]);
+        gradient[i] += weight * by_base;
+        gradient[self.top] += weight * by_supremum;
+        for (k, entry) in gradient.iter_mut().enumerate() {
+            if self.nominal[k] > 0.0 {
+                let base = self.nominal[k] * self.log_base[k].exp();
+                *entry -= weight * (by_base + by_supremum) * base;
+            }
+        }
+    }
+}
+
+impl Perturbation for FinitePerturbation {
+    type Law = FiniteLaw;
+
+    fn likelihood_ratio(&self, outcome: usize) -> f64 {
+        self.ratio[outcome]
+    }
+
+    fn supremum(&self) -> f64 {
+        self.ratio[self.top]
+    }
+
+    fn sample<R: Rng>(&self, random: &mut R) -> usize {
+        sample_index(&self.perturbed, random)
+    }
+
+    fn score(&self, outcome: usize, gradient: &mut [f64]) {
+        gradient.fill(0.0);
+        self.add_ratio_gradient(outcome, 1.0 / self.ratio[outcome], gradient);
+    }
+
+    /// H(q) = -sum q log q of the perturbed law q = P delta.
+    fn entropy(&self, gradient: &mut [f64]) -> f64 {
+        gradient.fill(0.0);
+        let mut entropy = 0.0;
+        for i in 0..MOVES {
+            let q = self.perturbed[i];
+            if q > 0.0 {
+                let log_q = q.ln();
+                entropy -= q * log_q;
+                // The constant 1 of d(q log q) drops out: sum_i P_i d delta_i = 0.
+                self.add_ratio_gradient(i, -self.nominal[i] * log_q, gradient);
+            }
+        }
+        entropy
+    }
+
+    fn normalisation_error(&self) -> f64 {
+        (self.perturbed.iter().sum::<f64>() - 1.0).abs()
+    }
+}

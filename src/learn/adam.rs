@@ -1,0 +1,35 @@
+//! Adam (Kingma & Ba 2015) over one flat vector, with all of its state in the open.
+
+/// Decay rates and the guard of the division, as everywhere in PPO (epsilon is CleanRL's).
+const BETA: [f64; 2] = [0.9, 0.999];
+const EPSILON: f64 = 1e-5;
+
+/// The optimiser of one player.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Adam {
+    first_moment: Vec<f32>,
+    second_moment: Vec<f32>,
+    steps: u64,
+}
+
+impl Adam {
+    /// A fresh optimiser of `parameters` numbers.
+    pub fn new(parameters: usize) -> Self {
+        Adam { first_moment: vec![0.0; parameters], second_moment: vec![0.0; parameters], steps: 0 }
+    }
+
+    /// One step of descent along `gradient`.
+    pub fn step(&mut self, parameters: &mut [f32], gradient: &[f32], learning_rate: f64) {
+        self.steps += 1;
+        let correction = BETA.map(|beta| 1.0 - beta.powf(self.steps as f64));
+        let step = (learning_rate / correction[0]) as f32;
+        let root = 1.0 / correction[1].sqrt() as f32;
+        let [beta_1, beta_2] = BETA.map(|beta| beta as f32);
+        let moments = self.first_moment.iter_mut().zip(&mut self.second_moment);
+        for ((parameter, &g), (m, v)) in parameters.iter_mut().zip(gradient).zip(moments) {
+            *m = beta_1 * *m + (1.0 - beta_1) * g;
+            *v = beta_2 * *v + (1.0 - beta_2) * g * g;
+            *parameter -= step * *m / (v.sqrt() * root + EPSILON as f32);
+        }
+    }
+}

@@ -1,0 +1,282 @@
+//! Proximal policy optimisation (Schulman et al. 2017), one implementation for both players.
+//!
+//! With the probability ratio `r = pi(choice) / pi_old(choice)` and the advantage A, normalised over
+//! the minibatch, a minibatch's loss is the mean of
+//!
+//! ```text
+//! -min(r A, clip(r, 1 - eps, 1 + eps) A) - c_entropy H + c_value (V - R)^2,    R = A_gae + V_old.
+//! ```
+//!
+//! Its gradient by the outputs of actor and critic is written out in [`loss`]; the networks carry it
+//! to the parameters.
+
+use crate::learn::adam::Adam;
+use crate::learn::gae;
+use crate::learn::head::{Head, MAX_PARAMETERS};
+use crate::learn::network::{Network, Shape};
+use crate::learn::options::PlayerOptions;
+use crate::learn::rollout::Trajectories;
+use lava_envs::random::ChaCha8Rng;
+use rand::seq::SliceRandom;
+use tch::Device;
+
+/// A player: the head that gives its outputs a meaning, its networks and its optimiser.
+#[derive(Debug)]
+pub struct Player<H> {
+    /// What the actor's outputs mean.
+    pub head: H,
+    /// Actor and critic.
+    pub network: Network,
+    optimiser: Adam,
+}
+
+/// What an update reports, under the names that CleanRL's users know; means over its minibatches.
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
+pub struct Losses {
+    /// Clipped surrogate loss.
+    pub policy_loss: f64,
+    /// Mean squared error of the critic, before its coefficient.
+    pub value_loss: f64,
+    /// Mean entropy of the player's law in nats.
+    pub entropy: f64,
+    /// Schulman's low-variance estimate of KL(old || new): mean of (r - 1) - log r.
+    pub approx_kl: f64,
+    /// Share of samples whose ratio lies outside the clip range.
+    pub clip_fraction: f64,
+    /// Norm of the gradient before clipping.
+    pub gradient_norm: f64,
+    /// Share of the returns' variance that the old values explain.
+    pub explained_variance: f64,
+}
+
+impl Losses {
+    /// The first quantity that is not a finite number.
+    pub fn not_finite(&self) -> Option<&'static str> {
+        [
+            ("policy_loss", self.policy_loss),
+            ("value_loss", self.value_loss),
+            ("entropy", self.entropy),
+            ("gradient_norm", self.gradient_norm),
+        ]
+        .into_iter()
+        .find_map(|(name, value)| (!value.is_finite()).then_some(name))
+    }
+
+    fn add(&mut self, other: &Losses, weight: f64) {
+        self.policy_loss += weight * other.policy_loss;
+        self.value_loss += weight * other.value_loss;
+        self.entropy += weight * other.entropy;
+        self.approx_kl += weight * other.approx_kl;
+        self.clip_fraction += weight * other.clip_fraction;
+        self.gradient_norm += weight * other.gradient_norm;
+    }
+}
+
+/// Learning rate and entropy weight of one update.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Rates {
+    /// Adam's learning rate.
+    pub learning_rate: f64,
+    /// Weight of the entropy bonus.
+    pub entropy: f64,
+}
+
+/// One sample as the loss sees it.
+#[derive(Debug, Clone)]
+pub struct Sample<H: Head> {
+    /// What the law depended on.
+    pub given: H::Given,
+    /// What was chosen.
+    pub choice: H::Choice,
+    /// log-probability of the choice when it was made.
+    pub log_probability: f64,
+    /// Advantage estimate, not normalised.
+    pub advantage: f32,
+    /// Target R of the critic.
+    pub target: f32,
+}
+
+impl<H: Head> Player<H> {
+    /// A fresh player that sees `inputs` numbers.
+    pub fn new(
+        head: H,
+        inputs: usize,
+        hidden: usize,
+        device: Device,
+        random: &mut ChaCha8Rng,
+    ) -> Self {
+        let constants = head.constants();
+        let shape = Shape { inputs, hidden, outputs: head.outputs(), constants: constants.len() };
+        Self::with_network(head, Network::new(shape, &constants, device, random))
+    }
+
+    /// A player with a given network and a fresh optimiser.
+    pub fn with_network(head: H, network: Network) -> Self {
+        let shape = network.shape();
+        assert!(shape.outputs + shape.constants <= MAX_PARAMETERS, "parameters of the head");
+        let optimiser = Adam::new(shape.parameters());
+        Player { head, network, optimiser }
+    }
+
+    /// One update on the trajectories of a rollout: epochs of minibatches in random order.
+    pub fn update(
+        &mut self,
+        trajectories: &Trajectories<H>,
+        gamma: f64,
+        options: &PlayerOptions,
+        rates: Rates,
+        random: &mut ChaCha8Rng,
+    ) -> Losses {
+        let (mut values, mut advantages) = (Vec::new(), Vec::new());
+        self.network.values(&trajectories.inputs, &mut values);
+        gae::advantages(
+            &trajectories.rewards,
+            &trajectories.ended,
+            &values,
+            trajectories.slots,
+            gamma,
+            options.gae_lambda,
+            &mut advantages,
+        );
+        let samples: Vec<Sample<H>> = (0..advantages.len())
+            .map(|i| Sample {
+                given: trajectories.given[i],
+                choice: trajectories.choices[i],
+                log_probability: trajectories.log_probabilities[i],
+                advantage: advantages[i],
+                target: advantages[i] + values[i],
+            })
+            .collect();
+
+        let row = self.network.shape().row();
+        let mut order: Vec<usize> = (0..samples.len()).collect();
+        let mut losses = Losses {
+            explained_variance: explained_variance(&samples, &values),
+            ..Losses::default()
+        };
+        let minibatches = samples.len().div_ceil(options.minibatch) as f64;
+        let weight = 1.0 / (minibatches * f64::from(options.epochs));
+        let (mut inputs, mut batch, mut gradient) = (Vec::new(), Vec::new(), Vec::new());
+        for _ in 0..options.epochs {
+            order.shuffle(random);
+            for indices in order.chunks(options.minibatch) {
+                inputs.clear();
+                batch.clear();
+                for &i in indices {
+                    inputs.extend_from_slice(&trajectories.inputs[i * row..(i + 1) * row]);
+                    batch.push(samples[i].clone());
+                }
+                let head = &self.head;
+                let mut step =
+                    self.network.differentiate(&inputs, &mut gradient, |y, constants, by_c| {
+                        loss(head, &batch, options, rates.entropy, y, constants, by_c)
+                    });
+                step.gradient_norm = clip_norm(&mut gradient, options.gradient_norm);
+                losses.add(&step, weight);
+                let optimiser = &mut self.optimiser;
+                self.network.change(|parameters| {
+                    optimiser.step(parameters, &gradient, rates.learning_rate);
+                });
+            }
+        }
+        losses
+    }
+}
+
+/// The loss of a minibatch and its gradient.
+///
+/// `y` has a row per sample, the actor's outputs and the value, and is overwritten by the gradient;
+/// `by_constants` receives the gradient by the head's constants.
+pub fn loss<H: Head>(
+    head: &H,
+    samples: &[Sample<H>],
+    options: &PlayerOptions,
+    entropy_weight: f64,
+    y: &mut [f32],
+    constants: &[f32],
+    by_constants: &mut [f32],
+) -> Losses {
+    let share = 1.0 / samples.len() as f64;
+    let mean = samples.iter().map(|s| f64::from(s.advantage)).sum::<f64>() * share;
+    let variance = samples.iter().map(|s| (f64::from(s.advantage) - mean).powi(2)).sum::<f64>()
+        / (samples.len() as f64 - 1.0).max(1.0);
+    let scale = 1.0 / (variance.sqrt() + 1e-8);
+
+    let outputs = head.outputs();
+    let count = outputs + constants.len();
+    let mut parameters = [0.0; MAX_PARAMETERS];
+    for (parameter, &constant) in parameters[outputs..].iter_mut().zip(constants) {
+        *parameter = f64::from(constant);
+    }
+    let mut score = [0.0; MAX_PARAMETERS];
+    let mut by_entropy = [0.0; MAX_PARAMETERS];
+    let mut constants_gradient = [0.0; MAX_PARAMETERS];
+    let mut losses = Losses::default();
+    for (sample, row) in samples.iter().zip(y.chunks_exact_mut(outputs + 1)) {
+        for (parameter, &output) in parameters.iter_mut().zip(&row[..outputs]) {
+            *parameter = f64::from(output);
+        }
+        let (log_probability, entropy) = head.gradients(
+            &parameters[..count],
+            &sample.given,
+            &sample.choice,
+            &mut score[..count],
+            &mut by_entropy[..count],
+        );
+        let log_ratio = log_probability - sample.log_probability;
+        let ratio = log_ratio.exp();
+        let advantage = (f64::from(sample.advantage) - mean) * scale;
+        let clipped = ratio.clamp(1.0 - options.clip, 1.0 + options.clip);
+        let surrogate = (ratio * advantage).min(clipped * advantage);
+        // Where the clipped branch is the smaller one it is constant in the parameters.
+        let by_log_probability =
+            if ratio * advantage <= clipped * advantage { -share * ratio * advantage } else { 0.0 };
+        let error = f64::from(row[outputs]) - f64::from(sample.target);
+
+        losses.policy_loss -= share * surrogate;
+        losses.value_loss += share * error * error;
+        losses.entropy += share * entropy;
+        losses.approx_kl += share * (ratio - 1.0 - log_ratio);
+        losses.clip_fraction += share * f64::from(u8::from(ratio != clipped));
+
+        let gradient =
+            |i: usize| by_log_probability * score[i] - share * entropy_weight * by_entropy[i];
+        for (i, output) in row[..outputs].iter_mut().enumerate() {
+            *output = gradient(i) as f32;
+        }
+        for i in 0..constants.len() {
+            constants_gradient[i] += gradient(outputs + i);
+        }
+        row[outputs] = (2.0 * options.value_coefficient * share * error) as f32;
+    }
+    for (slot, value) in by_constants.iter_mut().zip(constants_gradient) {
+        *slot = value as f32;
+    }
+    losses
+}
+
+/// Scales the gradient down to `limit` if it is longer; returns its norm before.
+fn clip_norm(gradient: &mut [f32], limit: f64) -> f64 {
+    let norm = gradient.iter().map(|&g| f64::from(g) * f64::from(g)).sum::<f64>().sqrt();
+    if norm > limit {
+        let scale = (limit / norm) as f32;
+        gradient.iter_mut().for_each(|g| *g *= scale);
+    }
+    norm
+}
+
+fn explained_variance<H: Head>(samples: &[Sample<H>], values: &[f32]) -> f64 {
+    let variance = |numbers: &mut dyn Iterator<Item = f64>| {
+        let (mut count, mut sum, mut squares) = (0.0, 0.0, 0.0);
+        for x in numbers {
+            count += 1.0;
+            sum += x;
+            squares += x * x;
+        }
+        squares / count - (sum / count).powi(2)
+    };
+    let targets = variance(&mut samples.iter().map(|s| f64::from(s.target)));
+    let pairs = samples.iter().zip(values);
+    let errors = variance(&mut pairs.map(|(s, &v)| f64::from(s.target) - f64::from(v)));
+    if targets > 0.0 { 1.0 - errors / targets } else { 0.0 }
+}

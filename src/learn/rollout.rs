@@ -1,0 +1,221 @@
+//! Rollouts: a fixed number of steps of parallel games, recorded for both players.
+
+use crate::game::budget::{Budget, Eta};
+use crate::game::returns::Atom;
+use crate::learn::arena::Arena;
+use crate::learn::contest::{Chance, Choosing, Contest, Streams, parameters_of};
+use crate::learn::head::{AntagonistHead, Head};
+use crate::learn::options::Credit;
+use crate::learn::pair::Pair;
+use lava_envs::random::{Purpose, stream};
+use lava_envs::{End, Law};
+
+/// What one player saw, chose and earned. Time-major: index `t * slots + slot`.
+#[derive(Debug, Clone)]
+pub struct Trajectories<H: Head> {
+    /// Number of slots.
+    pub slots: usize,
+    /// Inputs, shape `[steps + 1, slots, inputs + 1]`; the last block is the state after the last
+    /// step, for bootstrapping.
+    pub inputs: Vec<f32>,
+    /// What the law depended on, `[steps, slots]`.
+    pub given: Vec<H::Given>,
+    /// Choices, `[steps, slots]`.
+    pub choices: Vec<H::Choice>,
+    /// log-probabilities of the choices, `[steps, slots]`.
+    pub log_probabilities: Vec<f64>,
+    /// The player's own rewards, `[steps, slots]`.
+    pub rewards: Vec<f32>,
+    /// Whether the episode ended with this step, `[steps, slots]`.
+    pub ended: Vec<bool>,
+}
+
+impl<H: Head> Trajectories<H> {
+    fn new(slots: usize) -> Self {
+        Trajectories {
+            slots,
+            inputs: Vec::new(),
+            given: Vec::new(),
+            choices: Vec::new(),
+            log_probabilities: Vec::new(),
+            rewards: Vec::new(),
+            ended: Vec::new(),
+        }
+    }
+
+    fn clear(&mut self) {
+        self.inputs.clear();
+        self.given.clear();
+        self.choices.clear();
+        self.log_probabilities.clear();
+        self.rewards.clear();
+        self.ended.clear();
+    }
+}
+
+/// Plays and records.
+pub struct Collector<W: Arena> {
+    contest: Contest<W>,
+    /// The budget that each slot's episode started with; it differs while the budget rises.
+    start: Vec<Eta>,
+    running: Vec<Running>,
+    gamma: f64,
+    /// What the protagonist recorded in the last rollout.
+    pub protagonist: Trajectories<W::Policy>,
+    /// What the antagonist recorded; empty if it took no part.
+    pub antagonist: Trajectories<AntagonistHead<W::Family>>,
+    /// Episodes that ended in the last rollout, their masses of no meaning.
+    pub finished: Vec<Atom>,
+    /// max prod delta / eta over all trajectories so far, at most 1 up to rounding.
+    pub budget_use: f64,
+}
+
+/// Sums of the episode in a slot.
+#[derive(Debug, Clone, Copy)]
+struct Running {
+    value: f64,
+    undiscounted: f64,
+    discount: f64,
+    steps: u32,
+    /// prod delta so far.
+    product: f64,
+}
+
+impl Running {
+    const START: Running =
+        Running { value: 0.0, undiscounted: 0.0, discount: 1.0, steps: 0, product: 1.0 };
+}
+
+impl<W: Arena> Collector<W> {
+    /// Games in all slots of `world`, not yet started.
+    pub fn new(world: W, pair: &Pair<W>, gamma: f64, seed: u64) -> Self {
+        let slots = world.episodes();
+        let streams = (0..slots as u64)
+            .map(|slot| Streams {
+                actions: stream(seed, Purpose::Actions, slot),
+                outcomes: stream(seed, Purpose::Outcomes, slot),
+            })
+            .collect();
+        let mut contest = Contest::new(world, streams, &pair.views);
+        for slot in 0..slots {
+            contest.start(slot, Eta::NEUTRAL);
+        }
+        Collector {
+            contest,
+            start: vec![Eta::NEUTRAL; slots],
+            running: vec![Running::START; slots],
+            gamma,
+            protagonist: Trajectories::new(slots),
+            antagonist: Trajectories::new(slots),
+            finished: Vec::new(),
+            budget_use: 0.0,
+        }
+    }
+
+    /// Plays `steps` steps in every slot; episodes that end are followed by new ones. New episodes
+    /// start with budget `eta`; a game at budget 1 is played without the antagonist.
+    pub fn collect(&mut self, pair: &Pair<W>, eta: Eta, steps: usize, credit: Credit) {
+        self.protagonist.clear();
+        self.antagonist.clear();
+        self.finished.clear();
+        let chance = if eta.is_neutral() { Chance::Nominal } else { Chance::Antagonist };
+        for slot in 0..self.contest.slots() {
+            // No step was made yet: the episode has this budget as well.
+            if self.contest.world.time(slot) == 0 {
+                self.begin(slot, eta);
+            }
+        }
+        for _ in 0..steps {
+            self.contest.step(pair, Choosing::Sampled, &chance);
+            self.record_protagonist(pair, credit);
+            if !eta.is_neutral() {
+                self.record_antagonist();
+            }
+            for slot in 0..self.contest.slots() {
+                self.count(slot, eta);
+            }
+        }
+        // The states after the last step. The antagonist's state holds an action: one is drawn for
+        // this purpose alone, which leaves its value unbiased.
+        self.contest.choose(&pair.protagonist, &pair.views, Choosing::Sampled);
+        self.protagonist.inputs.extend_from_slice(&self.contest.protagonist_inputs);
+        if !eta.is_neutral() {
+            self.contest.show_antagonist(&pair.views);
+            self.antagonist.inputs.extend_from_slice(&self.contest.antagonist_inputs);
+        }
+    }
+
+    fn begin(&mut self, slot: usize, eta: Eta) {
+        self.contest.start(slot, eta);
+        self.start[slot] = eta;
+        self.running[slot] = Running::START;
+    }
+
+    fn record_protagonist(&mut self, pair: &Pair<W>, credit: Credit) {
+        let contest = &self.contest;
+        let record = &mut self.protagonist;
+        record.inputs.extend_from_slice(&contest.protagonist_inputs);
+        for slot in 0..contest.slots() {
+            let choice = match credit {
+                Credit::Chosen => None,
+                Credit::Executed => W::executed(contest.outcomes[slot]),
+            }
+            .unwrap_or(contest.actions[slot]);
+            let parameters = parameters_of(&pair.protagonist, &contest.protagonist_outputs, slot);
+            let log_probability = pair.protagonist.head.log_probability(&parameters, &(), &choice);
+            record.given.push(());
+            record.choices.push(choice);
+            record.log_probabilities.push(log_probability);
+            record.rewards.push(contest.steps[slot].reward as f32);
+            record.ended.push(contest.steps[slot].end.is_some());
+        }
+    }
+
+    fn record_antagonist(&mut self) {
+        let contest = &self.contest;
+        let record = &mut self.antagonist;
+        record.inputs.extend_from_slice(&contest.antagonist_inputs);
+        for slot in 0..contest.slots() {
+            let (law, outcome) = (contest.laws[slot], contest.outcomes[slot]);
+            record.given.push((law, contest.budgets_before[slot]));
+            record.choices.push(outcome);
+            // The antagonist's law is the perturbed law: log(P_t(o) delta_t(o)).
+            record.log_probabilities.push(law.log_density(outcome) + contest.ratios[slot].ln());
+            record.rewards.push(-contest.steps[slot].reward as f32);
+            record.ended.push(contest.steps[slot].end.is_some());
+        }
+    }
+
+    /// Books the last step of a slot, and begins anew behind the end of an episode.
+    fn count(&mut self, slot: usize, eta: Eta) {
+        let step = self.contest.steps[slot];
+        let running = &mut self.running[slot];
+        running.value += running.discount * step.reward;
+        running.undiscounted += step.reward;
+        running.discount *= self.gamma;
+        running.steps += 1;
+        running.product *= self.contest.ratios[slot];
+        if let Some(end) = step.end {
+            let Running { value, undiscounted, steps, product, .. } = *running;
+            self.finished.push(Atom { value, undiscounted, steps, end, mass: 1.0 });
+            self.budget_use = self.budget_use.max(product / self.start[slot].get());
+            self.begin(slot, eta);
+        }
+    }
+
+    /// Mean undiscounted return of the episodes that ended in the last rollout; NaN if none did.
+    pub fn mean_return(&self) -> f64 {
+        self.finished.iter().map(|e| e.undiscounted).sum::<f64>() / self.finished.len() as f64
+    }
+
+    /// Share of the ended episodes that ended so.
+    pub fn share(&self, end: End) -> f64 {
+        let count = self.finished.iter().filter(|e| e.end == end).count();
+        count as f64 / self.finished.len() as f64
+    }
+
+    /// Budgets that remain, for tests.
+    pub fn budgets(&self) -> &[Budget] {
+        &self.contest.budgets
+    }
+}

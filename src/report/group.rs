@@ -1,0 +1,304 @@
+//! Runs of one world and eta, measured and bootstrapped: what the tables are computed from.
+
+use super::runs::{Run, Runs};
+use super::statistics::{self, Estimate};
+use crate::experiment::artefacts::{Chance, Mode};
+use crate::game::returns::ReturnLaw;
+use lava_envs::End;
+use lava_envs::random::{self, ChaCha8Rng, Purpose};
+use rand_distr::{Distribution as _, StandardNormal};
+
+/// The risk levels of the cross matrix.
+pub const ALPHAS: [f64; 7] = [1.0, 0.5, 0.25, 0.1, 0.05, 0.04, 0.01];
+
+/// Bootstrap replicates: the noise they leave in an end of an interval is about a twentieth of its
+/// width.
+const REPLICATES: usize = 2000;
+
+/// What is measured of one run, or of its redrawn episodes. `None` where it does not exist.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct Measures {
+    /// Set of a failed run without evaluation: all else is `None`.
+    pub absent: bool,
+    /// E[J] of the greedy protagonist under nominal chance.
+    pub mean: Option<f64>,
+    /// Its CVaR at every alpha of [`Group::alphas`].
+    pub cvar: Vec<Option<f64>>,
+    /// Its lava rate.
+    pub lava: Option<f64>,
+    /// Its goal rate.
+    pub goal: Option<f64>,
+    /// Its timeout rate.
+    pub timeout: Option<f64>,
+    /// Mean steps of its episodes that reach the goal.
+    pub steps_to_goal: Option<f64>,
+    /// Its mean least distance to lava.
+    pub clearance: Option<f64>,
+    /// E[J] of the sampled protagonist under nominal chance.
+    pub sampled_mean: Option<f64>,
+    /// CVaR_{1/eta} of the sampled protagonist under nominal chance.
+    pub sampled_cvar: Option<f64>,
+    /// E[J] of the sampled protagonist under its antagonist.
+    pub game_value: Option<f64>,
+    /// `game_value - sampled_cvar`.
+    pub bound_slack: Option<f64>,
+    /// E[J] of the greedy protagonist under its antagonist.
+    pub greedy_game_value: Option<f64>,
+    /// V*(eta) - CVaR_{1/eta}.
+    pub regret: Option<f64>,
+    /// Greedy game value - CVaR_{1/eta}.
+    pub antagonist_gap: Option<f64>,
+}
+
+/// The four laws of the return that a run is measured by.
+struct Laws {
+    greedy: Option<ReturnLaw>,
+    sampled: Option<ReturnLaw>,
+    game: Option<ReturnLaw>,
+    greedy_game: Option<ReturnLaw>,
+}
+
+impl Laws {
+    fn of(run: &Run, mut take: impl FnMut(&ReturnLaw) -> ReturnLaw) -> Laws {
+        let greedy = run.law(Mode::Greedy, Chance::Nominal).map(&mut take);
+        let sampled = run.law(Mode::Sampled, Chance::Nominal).map(&mut take);
+        // At eta = 1 the game is the nominal play: the same episodes, not others like them.
+        let (game, greedy_game) = if run.eta == 1.0 {
+            (sampled.clone(), greedy.clone())
+        } else {
+            (run.game_law(Mode::Sampled).map(&mut take), run.game_law(Mode::Greedy).map(&mut take))
+        };
+        Laws { greedy, sampled, game, greedy_game }
+    }
+}
+
+impl Measures {
+    fn of(run: &Run, alphas: &[f64]) -> Measures {
+        let laws = Laws::of(run, ReturnLaw::clone);
+        let certificate = run.evaluation.as_ref().and_then(|evaluation| evaluation.certificate);
+        let gap = certificate.map(|certificate| certificate.antagonist_gap);
+        let regret = certificate.map(|certificate| certificate.regret);
+        let cvar = statistics::cvar;
+        Measures::new(run, &laws, alphas, regret, gap, cvar)
+    }
+
+    /// The same of redrawn episodes. Certificates come as numbers: the regret's is exact, the gap's
+    /// has a standard error, which stands for its episodes.
+    fn redrawn(run: &Run, found: &Measures, alphas: &[f64], random: &mut ChaCha8Rng) -> Measures {
+        let laws = Laws::of(run, |law| statistics::redraw(law, random));
+        let certificate = run.evaluation.as_ref().and_then(|evaluation| evaluation.certificate);
+        let gap = certificate.map(|certificate| {
+            let noise: f64 = StandardNormal.sample(random);
+            certificate.antagonist_gap + noise * certificate.antagonist_gap_standard_error
+        });
+        let regret = certificate.map(|certificate| certificate.regret);
+        let mut measures =
+            Measures::new(run, &laws, alphas, regret, gap, |law, alpha| Some(law.cvar(alpha)));
+        // A redrawn law counts no episodes; what the original refuses stays refused.
+        for (redrawn, found) in measures.cvar.iter_mut().zip(&found.cvar) {
+            *redrawn = found.and(*redrawn);
+        }
+        measures.sampled_cvar = found.sampled_cvar.and(measures.sampled_cvar);
+        measures.bound_slack = found.bound_slack.and(measures.bound_slack);
+        measures
+    }
+
+    fn new(
+        run: &Run,
+        laws: &Laws,
+        alphas: &[f64],
+        regret: Option<f64>,
+        antagonist_gap: Option<f64>,
+        cvar: impl Fn(&ReturnLaw, f64) -> Option<f64>,
+    ) -> Measures {
+        let greedy = laws.greedy.as_ref();
+        let rate = |end| greedy.map(|law| law.probability(end));
+        let sampled_cvar = laws.sampled.as_ref().and_then(|law| cvar(law, run.alpha()));
+        let game_value = laws.game.as_ref().map(ReturnLaw::mean);
+        Measures {
+            absent: run.evaluation.is_none(),
+            mean: greedy.map(ReturnLaw::mean),
+            cvar: alphas.iter().map(|&alpha| greedy.and_then(|law| cvar(law, alpha))).collect(),
+            lava: rate(End::Lava),
+            goal: rate(End::Goal),
+            timeout: rate(End::Timeout),
+            steps_to_goal: greedy.and_then(ReturnLaw::steps_to_goal),
+            clearance: run.clearance(),
+            sampled_mean: laws.sampled.as_ref().map(ReturnLaw::mean),
+            sampled_cvar,
+            game_value,
+            bound_slack: game_value.zip(sampled_cvar).map(|(value, cvar)| value - cvar),
+            greedy_game_value: laws.greedy_game.as_ref().map(ReturnLaw::mean),
+            regret,
+            antagonist_gap,
+        }
+    }
+}
+
+/// All seeds of one world and eta.
+pub struct Group<'a> {
+    /// Name of the world.
+    pub env: &'a str,
+    /// Budget eta.
+    pub eta: f64,
+    /// Its runs, by seed.
+    pub runs: &'a [Run],
+    /// The levels at which CVaR is measured, descending: [`ALPHAS`] and 1/eta of every eta of the
+    /// world.
+    pub alphas: Vec<f64>,
+    /// Of every run.
+    pub measures: Vec<Measures>,
+    /// Of every bootstrap replicate, of every run drawn.
+    replicates: Vec<Vec<Measures>>,
+}
+
+/// The runs, measured and bootstrapped, by world and eta.
+pub fn groups(runs: &Runs) -> Vec<Group<'_>> {
+    let mut groups = Vec::new();
+    for world in runs.runs.chunk_by(|a, b| a.env == b.env) {
+        let mut alphas: Vec<f64> = ALPHAS.into_iter().chain(world.iter().map(Run::alpha)).collect();
+        alphas.sort_by(|a, b| b.total_cmp(a));
+        alphas.dedup();
+        for runs in world.chunk_by(|a, b| a.eta == b.eta) {
+            groups.push(Group::new(runs, alphas.clone()));
+        }
+    }
+    groups
+}
+
+impl<'a> Group<'a> {
+    fn new(runs: &'a [Run], alphas: Vec<f64>) -> Self {
+        let (env, eta) = (runs[0].env.as_str(), runs[0].eta);
+        let measures: Vec<Measures> = runs.iter().map(|run| Measures::of(run, &alphas)).collect();
+        // The stream belongs to the group's name, so its intervals do not move when others come.
+        let index = fnv(&format!("{env}/eta-{eta}")) & ((1 << 56) - 1);
+        let mut random = random::stream(0, Purpose::Bootstrap, index);
+        let seeds: Vec<(&Run, &Measures)> = runs.iter().zip(&measures).collect();
+        let replicates = statistics::nested_bootstrap(
+            &seeds,
+            REPLICATES,
+            &mut random,
+            |(run, found), random| Measures::redrawn(run, found, &alphas, random),
+        );
+        Group { env, eta, runs, alphas, measures, replicates }
+    }
+
+    /// Number of runs that failed.
+    pub fn failures(&self) -> usize {
+        self.runs.iter().filter(|run| run.failure.is_some()).count()
+    }
+
+    /// Risk level alpha = 1/eta.
+    pub fn alpha(&self) -> f64 {
+        1.0 / self.eta
+    }
+
+    /// The place of a level in [`Measures::cvar`].
+    ///
+    /// # Panics
+    /// If the level is none of [`Group::alphas`].
+    pub fn level(&self, alpha: f64) -> usize {
+        let place = self.alphas.iter().position(|&level| level == alpha);
+        place.expect("every alpha of the world is measured")
+    }
+
+    /// Mean over the runs that have the measure, with the nested bootstrap's interval.
+    pub fn mean(&self, measure: impl Fn(&Measures) -> Option<f64>) -> Option<Estimate> {
+        self.estimate(|measures| {
+            statistics::mean(&measures.iter().filter_map(&measure).collect::<Vec<f64>>())
+        })
+    }
+
+    /// Interquartile mean over all runs.
+    pub fn iqm(&self, measure: impl Fn(&Measures) -> Option<f64>) -> Option<Estimate> {
+        self.estimate(|measures| statistics::iqm(&ranked(measures, &measure)?))
+    }
+
+    /// A rate over all episodes of all runs. Where Wilson's interval of as many recorded episodes is
+    /// wider than the bootstrap's, as it is for what never happened, it widens it.
+    pub fn rate(&self, measure: impl Fn(&Measures) -> Option<f64>) -> Option<Estimate> {
+        let mut estimate = self.mean(&measure)?;
+        let (mut successes, mut trials) = (0.0, 0.0);
+        for (run, measures) in self.runs.iter().zip(&self.measures) {
+            let law = run.law(Mode::Greedy, Chance::Nominal);
+            if let Some((episodes, rate)) = law.and_then(ReturnLaw::episodes).zip(measure(measures))
+            {
+                successes += rate * episodes as f64;
+                trials += episodes as f64;
+            }
+        }
+        if let (Some(interval), Some(wilson)) =
+            (&mut estimate.interval, statistics::wilson(successes, trials))
+        {
+            interval.low = interval.low.min(wilson.low);
+            interval.high = interval.high.max(wilson.high);
+        }
+        Some(estimate)
+    }
+
+    /// The worst run by a measure and its seed; a failed one is worse than any number, and then the
+    /// value is minus infinity.
+    pub fn worst(&self, measure: impl Fn(&Measures) -> Option<f64>) -> Option<(u64, f64)> {
+        let scores = ranked(&self.measures, &measure)?;
+        let worst = statistics::worst(&scores)?;
+        let place = scores.iter().position(|&score| score == worst)?;
+        Some((self.runs[place].seed, worst))
+    }
+
+    /// CVaR at this group's alpha minus the same of `baseline`, over the seeds that both have.
+    /// Answers with the number of these pairs too.
+    pub fn difference(&self, baseline: &Group) -> Option<(Estimate, usize)> {
+        let (own, other) = (self.level(self.alpha()), baseline.level(self.alpha()));
+        let differences: Vec<f64> = (self.runs.iter().zip(&self.measures))
+            .filter_map(|(run, measures)| {
+                let twin = baseline.runs.iter().position(|twin| twin.seed == run.seed)?;
+                let score = measures.cvar[own]?;
+                Some(score - baseline.measures[twin].cvar[other]?)
+            })
+            .collect();
+        Some((statistics::paired_difference(&differences)?, differences.len()))
+    }
+
+    /// Probability that a run of this group has a better CVaR at this group's alpha than a run of
+    /// `baseline`; a failed run loses against all but another failed one.
+    pub fn improvement(&self, baseline: &Group) -> Option<Estimate> {
+        let (own, other) = (self.level(self.alpha()), baseline.level(self.alpha()));
+        let compare = |x: &[Measures], y: &[Measures]| {
+            let x = ranked(x, &|measures| measures.cvar[own])?;
+            let y = ranked(y, &|measures| measures.cvar[other])?;
+            statistics::improvement(&x, &y)
+        };
+        let value = compare(&self.measures, &baseline.measures)?;
+        let replicates: Vec<f64> = (self.replicates.iter().zip(&baseline.replicates))
+            .filter_map(|(x, y)| compare(x, y))
+            .collect();
+        let enough = self.runs.len() > 1 && baseline.runs.len() > 1;
+        let interval = statistics::percentile_interval(&replicates).filter(|_| enough);
+        Some(Estimate { value, interval })
+    }
+
+    fn estimate(&self, statistic: impl Fn(&[Measures]) -> Option<f64>) -> Option<Estimate> {
+        let value = statistic(&self.measures)?;
+        let replicates: Vec<f64> =
+            self.replicates.iter().filter_map(|replicate| statistic(replicate)).collect();
+        // One seed tells nothing of the spread between seeds: its episodes alone would make an
+        // interval that looks like an answer.
+        let enough = self.measures.iter().filter(|measures| !measures.absent).count() > 1;
+        let interval = statistics::percentile_interval(&replicates).filter(|_| enough);
+        Some(Estimate { value, interval })
+    }
+}
+
+/// Scores for statistics that rank: a failed run is minus infinity. `None` if a run that did not fail
+/// has no score.
+fn ranked(measures: &[Measures], measure: &impl Fn(&Measures) -> Option<f64>) -> Option<Vec<f64>> {
+    let score = |of: &Measures| if of.absent { Some(f64::NEG_INFINITY) } else { measure(of) };
+    measures.iter().map(score).collect()
+}
+
+/// The FNV-1a hash: one number for a name, the same on every machine and in every version.
+fn fnv(name: &str) -> u64 {
+    name.bytes().fold(0xcbf2_9ce4_8422_2325, |hash, byte| {
+        (hash ^ u64::from(byte)).wrapping_mul(0x100_0000_01b3)
+    })
+}

@@ -1,0 +1,348 @@
+//! Formats of the table: terminal, Markdown, CSV and JSON, each from the one description in
+//! [`super::table`].
+//!
+//! A further format is one more type with [`Render`]; [`Column`] gives it headings and meaning,
+//! [`Cell`] the numbers, [`legend`] the words below.
+
+use super::runs::{csv_text, number};
+use super::statistics::Interval;
+use super::table::{Block, COLUMNS, Cell, Column, Format, Row, Table, World};
+use crate::experiment::artefacts::SCHEMA;
+use comfy_table::{CellAlignment, LineStyle, TableStyle};
+use serde_json::{Value, json};
+
+/// Stands for a number that does not exist.
+const MISSING: &str = "–";
+
+/// Width of running text on a terminal.
+const TEXT_WIDTH: usize = 110;
+
+/// Lines across, none down: a separator between columns would cost the width that intervals need.
+const STYLE: TableStyle = TableStyle::new()
+    .header_separator(LineStyle::none().fill('─'))
+    .row_separator(LineStyle::none().fill('┈'));
+
+/// A format of the table.
+pub trait Render {
+    /// The whole table as text.
+    fn render(&self, table: &Table) -> String;
+}
+
+/// The two blocks that people see of a world.
+const BLOCKS: [(Block, &str); 2] = [
+    (Block::Returns, "greedy protagonist under nominal chance"),
+    (Block::Game, "against eta = 1, the game, certificates"),
+];
+
+/// The columns of a block that have a number in this world.
+fn columns(world: &World, block: Block) -> Vec<(usize, &'static Column)> {
+    let shown = |(place, column): &(usize, &Column)| column.block == block && world.has(*place);
+    COLUMNS.iter().enumerate().filter(shown).collect()
+}
+
+/// How the numbers came about, as terms and their meaning: columns shown, intervals, episodes, checks.
+pub fn legend(table: &Table) -> Vec<(String, String)> {
+    let mut legend = Vec::new();
+    for (place, column) in COLUMNS.iter().enumerate() {
+        if column.block != Block::Data && table.worlds.iter().any(|world| world.has(place)) {
+            legend.push((column.title.to_owned(), column.meaning.to_owned()));
+        }
+    }
+    let text = "[low, high] is a 95 % interval. Numbers are means over seeds, their intervals a nested \
+                bootstrap (seeds, then episodes; 2,000 replicates, percentiles). Rates: never \
+                narrower than Wilson's interval of all episodes. gain: Student t over the paired \
+                seeds. With one seed there is none.";
+    legend.push(("intervals".to_owned(), text.to_owned()));
+    let text = "does not exist for the row, or is a CVaR whose tail holds fewer than 10 episodes";
+    legend.push((MISSING.to_owned(), text.to_owned()));
+    for world in &table.worlds {
+        legend.push((world.name.clone(), format!("{}. {}", world.episodes, world.checks)));
+    }
+    legend
+}
+
+/// A cell in words: its value and what stands below or behind it.
+fn words(format: Format, cell: Cell) -> (String, Option<String>) {
+    let (decimals, factor) = match format {
+        Format::Count => (0, 1.0),
+        Format::Estimate(decimals) | Format::Worst(decimals) => (decimals, 1.0),
+        Format::Percent => (2, 100.0),
+    };
+    let fixed = |value: f64| fixed(value * factor, decimals);
+    match cell {
+        Cell::Missing => (MISSING.to_owned(), None),
+        Cell::Baseline => ("baseline".to_owned(), None),
+        Cell::Count(count) => (count.to_string(), None),
+        Cell::Worst { seed, value } => (fixed(value), Some(format!("seed {seed}"))),
+        Cell::Estimate(estimate) => {
+            let ends = |Interval { low, high }| format!("[{}, {}]", fixed(low), fixed(high));
+            (fixed(estimate.value), estimate.interval.map(ends))
+        }
+    }
+}
+
+/// A number with so many decimals; no minus before a zero; minus infinity is a failed run.
+fn fixed(value: f64, decimals: usize) -> String {
+    if value == f64::NEG_INFINITY {
+        return "failed".to_owned();
+    }
+    let text = format!("{value:.decimals$}");
+    match text.strip_prefix('-') {
+        Some(digits) if digits.chars().all(|digit| matches!(digit, '0' | '.')) => digits.to_owned(),
+        _ => text,
+    }
+}
+
+fn seeds(row: &Row) -> (String, Option<String>) {
+    let failed = (row.failures > 0).then(|| format!("{} failed", row.failures));
+    (row.seeds.to_string(), failed)
+}
+
+/// For a terminal, at most 140 columns wide: values above their intervals.
+pub struct Terminal;
+
+impl Render for Terminal {
+    fn render(&self, table: &Table) -> String {
+        let mut text = String::new();
+        for world in &table.worlds {
+            for (block, title) in BLOCKS {
+                let columns = columns(world, block);
+                if columns.is_empty() {
+                    continue;
+                }
+                let mut drawn = comfy_table::Table::new();
+                drawn.load_style(STYLE);
+                let titles = columns.iter().map(|(_, column)| column.title);
+                drawn.set_header(["eta", "seeds"].into_iter().chain(titles));
+                for row in &world.rows {
+                    let cells = columns
+                        .iter()
+                        .map(|&(place, column)| words(column.format, row.cells[place]));
+                    let cells = std::iter::once(seeds(row)).chain(cells).map(|(value, below)| {
+                        below.map_or(value.clone(), |below| format!("{value}\n{below}"))
+                    });
+                    drawn.add_row(std::iter::once(row.eta.to_string()).chain(cells));
+                }
+                for column in drawn.column_iter_mut() {
+                    column.set_cell_alignment(CellAlignment::Right);
+                }
+                text += &format!("{}: {title}\n{}\n\n", world.name, drawn.trim_fmt());
+            }
+        }
+        let legend = legend(table);
+        let width = legend.iter().map(|(term, _)| term.chars().count()).max().unwrap_or_default();
+        for (term, meaning) in &legend {
+            text += &wrapped(meaning, &format!("{term:<width$}  "), width + 2);
+        }
+        // Last, where the eye is when a long output has scrolled by.
+        for note in &table.notes {
+            text += &wrapped(note, "\n! ", 2);
+        }
+        text
+    }
+}
+
+/// Running text broken at words, after `first` and with later lines moved in.
+fn wrapped(text: &str, first: &str, indent: usize) -> String {
+    let mut out = first.to_owned();
+    let mut length = indent;
+    for (place, word) in text.split_whitespace().enumerate() {
+        let needed = word.chars().count() + usize::from(place > 0);
+        if place > 0 && length + needed > TEXT_WIDTH {
+            out += &format!("\n{}", " ".repeat(indent));
+            length = indent;
+        } else if place > 0 {
+            out.push(' ');
+        }
+        out += word;
+        length += needed;
+    }
+    out.push('\n');
+    out
+}
+
+/// GitHub's Markdown, padded so that it reads as plain text too.
+pub struct Markdown;
+
+impl Render for Markdown {
+    fn render(&self, table: &Table) -> String {
+        let mut text = "# Results\n".to_owned();
+        for note in &table.notes {
+            text += &format!("\n> {}\n", escaped(note));
+        }
+        for world in &table.worlds {
+            text += &format!("\n## {}\n", world.name);
+            for (block, title) in BLOCKS {
+                let columns = columns(world, block);
+                if columns.is_empty() {
+                    continue;
+                }
+                let titles = columns.iter().map(|(_, column)| column.title.to_owned());
+                let mut lines: Vec<Vec<String>> =
+                    vec![["eta", "seeds"].map(str::to_owned).into_iter().chain(titles).collect()];
+                for row in &world.rows {
+                    let cells = columns
+                        .iter()
+                        .map(|&(place, column)| words(column.format, row.cells[place]));
+                    let (count, failed) = seeds(row);
+                    let count =
+                        failed.map_or(count.clone(), |failed| format!("{count} ({failed})"));
+                    let cells = cells.map(|(value, behind)| {
+                        behind.map_or(value.clone(), |behind| format!("{value} {behind}"))
+                    });
+                    lines.push([row.eta.to_string(), count].into_iter().chain(cells).collect());
+                }
+                text +=
+                    &format!("\n{}{}:\n\n{}", title[..1].to_uppercase(), &title[1..], grid(&lines));
+            }
+        }
+        text += "\n## Legend\n\n";
+        for (term, meaning) in legend(table) {
+            text += &format!("- **{term}**: {}\n", escaped(&meaning));
+        }
+        text
+    }
+}
+
+/// Lines of cells, the first being the header, as a padded Markdown table.
+fn grid(lines: &[Vec<String>]) -> String {
+    let count = |cell: &String| cell.chars().count();
+    let widths: Vec<usize> = (0..lines[0].len())
+        .map(|place| lines.iter().map(|line| count(&line[place])).max().unwrap_or_default().max(4))
+        .collect();
+    let mut text = String::new();
+    for (number, line) in lines.iter().enumerate() {
+        for (cell, width) in line.iter().zip(&widths) {
+            text += &format!("| {cell:>width$} ");
+        }
+        text += "|\n";
+        if number == 0 {
+            for width in &widths {
+                text += &format!("| {}: ", "-".repeat(width - 1));
+            }
+            text += "|\n";
+        }
+    }
+    text
+}
+
+/// Keeps what a failure says from being read as Markdown.
+fn escaped(text: &str) -> String {
+    let line = text.split_whitespace().collect::<Vec<&str>>().join(" ");
+    line.replace('<', "&lt;").replace('*', "\\*").replace('`', "\\`")
+}
+
+/// CSV: `env,eta,alpha,seeds,failures`, then every column by its key; an estimate has `KEY`, `KEY_lo`
+/// and `KEY_hi`, the worst seed `KEY` and `KEY_seed`. Rates are fractions. Six decimals; empty where
+/// there is no number.
+pub struct Csv;
+
+impl Render for Csv {
+    fn render(&self, table: &Table) -> String {
+        let mut header = ["env", "eta", "alpha", "seeds", "failures"].map(str::to_owned).to_vec();
+        for Column { key, format, .. } in &COLUMNS {
+            header.push((*key).to_owned());
+            match format {
+                Format::Count => {}
+                Format::Worst(_) => header.push(format!("{key}_seed")),
+                Format::Estimate(_) | Format::Percent => {
+                    header.extend([format!("{key}_lo"), format!("{key}_hi")]);
+                }
+            }
+        }
+        let rows = table.worlds.iter().flat_map(|world| {
+            world.rows.iter().map(|row| {
+                let mut fields = vec![
+                    world.name.clone(),
+                    row.eta.to_string(),
+                    number(Some(1.0 / row.eta)),
+                    row.seeds.to_string(),
+                    row.failures.to_string(),
+                ];
+                for (column, &cell) in COLUMNS.iter().zip(&row.cells) {
+                    let width = match column.format {
+                        Format::Count => 1,
+                        Format::Worst(_) => 2,
+                        Format::Estimate(_) | Format::Percent => 3,
+                    };
+                    let end = fields.len() + width;
+                    match cell {
+                        Cell::Missing | Cell::Baseline => {}
+                        Cell::Count(count) => fields.push(count.to_string()),
+                        Cell::Worst { seed, value } => {
+                            fields.extend([number(Some(value)), seed.to_string()]);
+                        }
+                        Cell::Estimate(estimate) => {
+                            fields.push(number(Some(estimate.value)));
+                            fields.push(number(estimate.interval.map(|interval| interval.low)));
+                            fields.push(number(estimate.interval.map(|interval| interval.high)));
+                        }
+                    }
+                    fields.resize(end, String::new());
+                }
+                fields
+            })
+        });
+        csv_text(std::iter::once(header).chain(rows))
+    }
+}
+
+/// JSON: `{schema, columns: {KEY: {title, meaning}}, worlds: [{env, episodes, checks, rows: [{eta, alpha,
+/// seeds, failures, KEY: ..}]}], notes}`. An estimate is `{value, low, high}`, the worst seed `{value,
+/// seed}`, a count a number; `null` where there is no number.
+pub struct Json;
+
+impl Json {
+    /// The table as a value.
+    pub fn value(&self, table: &Table) -> Value {
+        let finite = |value: f64| Some(value).filter(|value| value.is_finite());
+        let cell = |cell: Cell| match cell {
+            Cell::Missing | Cell::Baseline => Value::Null,
+            Cell::Count(count) => json!(count),
+            Cell::Worst { seed, value } => json!({ "value": finite(value), "seed": seed }),
+            Cell::Estimate(estimate) => json!({
+                "value": finite(estimate.value),
+                "low": estimate.interval.and_then(|interval| finite(interval.low)),
+                "high": estimate.interval.and_then(|interval| finite(interval.high)),
+            }),
+        };
+        let row = |row: &Row| {
+            let mut value = json!({
+                "eta": row.eta,
+                "alpha": 1.0 / row.eta,
+                "seeds": row.seeds,
+                "failures": row.failures,
+            });
+            for (column, &content) in COLUMNS.iter().zip(&row.cells) {
+                value[column.key] = cell(content);
+            }
+            value
+        };
+        let worlds = table.worlds.iter().map(|world| {
+            json!({
+                "env": world.name,
+                "episodes": world.episodes,
+                "checks": world.checks,
+                "rows": world.rows.iter().map(row).collect::<Vec<Value>>(),
+            })
+        });
+        let columns: serde_json::Map<String, Value> = (COLUMNS.iter())
+            .map(|column| {
+                let said = json!({ "title": column.title, "meaning": column.meaning });
+                (column.key.to_owned(), said)
+            })
+            .collect();
+        json!({
+            "schema": SCHEMA,
+            "columns": columns,
+            "worlds": worlds.collect::<Vec<Value>>(),
+            "notes": table.notes,
+        })
+    }
+}
+
+impl Render for Json {
+    fn render(&self, table: &Table) -> String {
+        format!("{:#}\n", self.value(table))
+    }
+}

@@ -1,0 +1,489 @@
+//! The table of results: one row per world and eta, statistics over its seeds.
+//!
+//! [`COLUMNS`] is the one description of the table: key, heading, what it means, how it is computed
+//! and formatted. Every output format ([`super::render`]) is rendered from it, the legend too.
+
+use super::group::Group;
+use super::runs::{Run, Runs};
+use super::statistics::{self, Estimate};
+use crate::experiment::artefacts::{Audit, Chance, Mode};
+use crate::game::returns::ReturnLaw;
+
+/// Standard errors below zero at which the slack of the bound is called a leak. Over a hundred runs
+/// chance alone does that once in 300 tables.
+const LEAK_ERRORS: f64 = 4.0;
+
+/// Fewer seeds than this get a warning about the intervals.
+const FEW_SEEDS: usize = 6;
+
+/// Where a column is shown.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Block {
+    /// The first block of a world: returns and ends of episodes.
+    Returns,
+    /// The second block: comparison with eta = 1, the game, certificates.
+    Game,
+    /// Only where programs read.
+    Data,
+}
+
+/// Which kind of cell a column has, and how it is written.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Format {
+    /// A whole number.
+    Count,
+    /// An estimate with so many decimals.
+    Estimate(usize),
+    /// An estimate of a rate, in percent.
+    Percent,
+    /// The worst seed's number with so many decimals, and the seed.
+    Worst(usize),
+}
+
+/// One cell.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Cell {
+    /// There is no such number.
+    Missing,
+    /// The row is the one that the others are compared with.
+    Baseline,
+    /// A whole number.
+    Count(u64),
+    /// A statistic over seeds.
+    Estimate(Estimate),
+    /// The worst seed; minus infinity if it failed.
+    Worst {
+        /// The seed.
+        seed: u64,
+        /// Its number.
+        value: f64,
+    },
+}
+
+/// Description of a column.
+pub struct Column {
+    /// Name for programs.
+    pub key: &'static str,
+    /// Heading for people.
+    pub title: &'static str,
+    /// Where it is shown.
+    pub block: Block,
+    /// How it is written.
+    pub format: Format,
+    /// What it is, in one sentence of the legend.
+    pub meaning: &'static str,
+    compute: fn(&Group, Option<&Group>) -> Cell,
+}
+
+fn estimate(estimate: Option<Estimate>) -> Cell {
+    estimate.map_or(Cell::Missing, Cell::Estimate)
+}
+
+/// What compares a row with the world's row at eta = 1.
+fn against(
+    group: &Group,
+    baseline: Option<&Group>,
+    compare: impl Fn(&Group) -> Option<Cell>,
+) -> Cell {
+    match baseline {
+        Some(_) if group.eta == 1.0 => Cell::Baseline,
+        Some(baseline) => compare(baseline).unwrap_or(Cell::Missing),
+        None => Cell::Missing,
+    }
+}
+
+/// CVaR at a fixed level; levels of [`super::group::ALPHAS`] are always measured.
+fn cvar(group: &Group, alpha: f64) -> Cell {
+    let level = group.level(alpha);
+    estimate(group.mean(|measures| measures.cvar[level]))
+}
+
+/// Violations over the audits of a group's runs.
+fn violations(group: &Group) -> Option<u64> {
+    let audits = group.runs.iter().filter_map(|run| run.evaluation.as_ref()?.audit);
+    audits.map(|audit| audit.violations).reduce(|a, b| a + b)
+}
+
+/// The columns, in order. World, eta, alpha, seeds and failures stand before them in every format.
+pub const COLUMNS: [Column; 21] = [
+    Column {
+        key: "mean",
+        title: "mean",
+        block: Block::Returns,
+        format: Format::Estimate(3),
+        meaning: "mean return of the greedy protagonist under nominal chance",
+        compute: |group, _| estimate(group.mean(|measures| measures.mean)),
+    },
+    Column {
+        key: "cvar",
+        title: "CVaR_1/eta",
+        block: Block::Returns,
+        format: Format::Estimate(3),
+        meaning: "mean of the worst 1/eta of its returns: what the row was trained for",
+        compute: |group, _| cvar(group, group.alpha()),
+    },
+    Column {
+        key: "cvar_0.04",
+        title: "CVaR_0.04",
+        block: Block::Returns,
+        format: Format::Estimate(3),
+        meaning: "mean of its worst 4 % of returns",
+        compute: |group, _| cvar(group, 0.04),
+    },
+    Column {
+        key: "cvar_0.01",
+        title: "CVaR_0.01",
+        block: Block::Returns,
+        format: Format::Estimate(3),
+        meaning: "mean of its worst 1 % of returns",
+        compute: |group, _| cvar(group, 0.01),
+    },
+    Column {
+        key: "lava",
+        title: "lava %",
+        block: Block::Returns,
+        format: Format::Percent,
+        meaning: "share of its episodes that end in lava",
+        compute: |group, _| estimate(group.rate(|measures| measures.lava)),
+    },
+    Column {
+        key: "goal",
+        title: "goal %",
+        block: Block::Returns,
+        format: Format::Percent,
+        meaning: "share of its episodes that reach the goal; the rest runs into the time limit",
+        compute: |group, _| estimate(group.rate(|measures| measures.goal)),
+    },
+    Column {
+        key: "clearance",
+        title: "clearance",
+        block: Block::Returns,
+        format: Format::Estimate(3),
+        meaning: "least distance to lava in an episode, on average (lava-grid: cells; lava-point: metres)",
+        compute: |group, _| estimate(group.mean(|measures| measures.clearance)),
+    },
+    Column {
+        key: "cvar_iqm",
+        title: "IQM",
+        block: Block::Game,
+        format: Format::Estimate(3),
+        meaning: "interquartile mean over seeds of CVaR_1/eta: the middle half of the runs",
+        compute: |group, _| {
+            // Of three seeds it is the mean once more.
+            if group.runs.len() < 4 {
+                return Cell::Missing;
+            }
+            let level = group.level(group.alpha());
+            estimate(group.iqm(|measures| measures.cvar[level]))
+        },
+    },
+    Column {
+        key: "cvar_worst",
+        title: "worst seed",
+        block: Block::Game,
+        format: Format::Worst(3),
+        meaning: "CVaR_1/eta of the worst seed; a failed run is worse than any number",
+        compute: |group, _| {
+            let level = group.level(group.alpha());
+            let worst = group.worst(|measures| measures.cvar[level]);
+            worst.map_or(Cell::Missing, |(seed, value)| Cell::Worst { seed, value })
+        },
+    },
+    Column {
+        key: "gain",
+        title: "gain",
+        block: Block::Game,
+        format: Format::Estimate(3),
+        meaning: "CVaR_1/eta minus CVaR at that same level of the eta = 1 policy of the same seed \
+                  (positive: better than eta = 1)",
+        compute: |group, baseline| {
+            against(group, baseline, |baseline| {
+                group.difference(baseline).map(|(gain, _)| Cell::Estimate(gain))
+            })
+        },
+    },
+    Column {
+        key: "gain_pairs",
+        title: "pairs",
+        block: Block::Data,
+        format: Format::Count,
+        meaning: "number of seeds in gain",
+        compute: |group, baseline| {
+            against(group, baseline, |baseline| {
+                group.difference(baseline).map(|(_, pairs)| Cell::Count(pairs as u64))
+            })
+        },
+    },
+    Column {
+        key: "improvement",
+        title: "P(better)",
+        block: Block::Game,
+        format: Format::Estimate(2),
+        meaning: "probability that a run of the row beats a run of eta = 1 in CVaR at level 1/eta",
+        compute: |group, baseline| {
+            against(group, baseline, |baseline| group.improvement(baseline).map(Cell::Estimate))
+        },
+    },
+    Column {
+        key: "game_value",
+        title: "game value",
+        block: Block::Game,
+        format: Format::Estimate(3),
+        meaning: "mean return of the sampled protagonist under its learned antagonist (eta = 1: which can do nothing)",
+        compute: |group, _| estimate(group.mean(|measures| measures.game_value)),
+    },
+    Column {
+        key: "regret",
+        title: "regret",
+        block: Block::Game,
+        format: Format::Estimate(4),
+        meaning: "the best possible CVaR_1/eta minus that of the greedy protagonist",
+        compute: |group, _| estimate(group.mean(|measures| measures.regret)),
+    },
+    Column {
+        key: "antagonist_gap",
+        title: "antagonist gap",
+        block: Block::Game,
+        format: Format::Estimate(4),
+        meaning: "value of the greedy protagonist under its antagonist minus its CVaR_1/eta: \
+                  how far the antagonist is from the worst case (0: perfect)",
+        compute: |group, _| estimate(group.mean(|measures| measures.antagonist_gap)),
+    },
+    Column {
+        key: "timeout",
+        title: "timeout %",
+        block: Block::Data,
+        format: Format::Percent,
+        meaning: "share of its episodes that run into the time limit",
+        compute: |group, _| estimate(group.rate(|measures| measures.timeout)),
+    },
+    Column {
+        key: "steps_to_goal",
+        title: "steps to goal",
+        block: Block::Data,
+        format: Format::Estimate(1),
+        meaning: "mean length of its episodes that reach the goal",
+        compute: |group, _| estimate(group.mean(|measures| measures.steps_to_goal)),
+    },
+    Column {
+        key: "sampled_mean",
+        title: "sampled mean",
+        block: Block::Data,
+        format: Format::Estimate(3),
+        meaning: "mean return of the sampled protagonist under nominal chance",
+        compute: |group, _| estimate(group.mean(|measures| measures.sampled_mean)),
+    },
+    Column {
+        key: "sampled_cvar",
+        title: "sampled CVaR_1/eta",
+        block: Block::Data,
+        format: Format::Estimate(3),
+        meaning: "CVaR_1/eta of the sampled protagonist under nominal chance",
+        compute: |group, _| estimate(group.mean(|measures| measures.sampled_cvar)),
+    },
+    Column {
+        key: "bound_slack",
+        title: "bound slack",
+        block: Block::Data,
+        format: Format::Estimate(3),
+        meaning: "game value minus CVaR_1/eta of the sampled protagonist: not below 0, else the budget leaks",
+        compute: |group, _| estimate(group.mean(|measures| measures.bound_slack)),
+    },
+    Column {
+        key: "budget_violations",
+        title: "violations",
+        block: Block::Data,
+        format: Format::Count,
+        meaning: "steps or trajectories on which an antagonist overran its budget, over all seeds",
+        compute: |group, _| violations(group).map_or(Cell::Missing, Cell::Count),
+    },
+];
+
+/// One world and eta.
+#[derive(Debug, Clone)]
+pub struct Row {
+    /// Budget eta.
+    pub eta: f64,
+    /// Number of seeds, failed ones included.
+    pub seeds: usize,
+    /// Number of failed ones.
+    pub failures: usize,
+    /// One cell per entry of [`COLUMNS`].
+    pub cells: Vec<Cell>,
+}
+
+/// The rows of a world.
+#[derive(Debug, Clone)]
+pub struct World {
+    /// Its name.
+    pub name: String,
+    /// By eta.
+    pub rows: Vec<Row>,
+    /// How many episodes its numbers rest on.
+    pub episodes: String,
+    /// What the budget audits and the bound say.
+    pub checks: String,
+}
+
+impl World {
+    /// Whether the world has a number in the column.
+    pub fn has(&self, column: usize) -> bool {
+        let number = |row: &Row| !matches!(row.cells[column], Cell::Missing | Cell::Baseline);
+        self.rows.iter().any(number)
+    }
+}
+
+/// All that is printed.
+#[derive(Debug, Clone)]
+pub struct Table {
+    /// By name.
+    pub worlds: Vec<World>,
+    /// What a reader must know before trusting a number: failures, violations, runs left out.
+    pub notes: Vec<String>,
+}
+
+impl Table {
+    /// Computes every cell. `groups` are those of `runs`.
+    pub fn new(runs: &Runs, groups: &[Group]) -> Table {
+        let worlds = groups
+            .chunk_by(|a, b| a.env == b.env)
+            .map(|groups| {
+                let baseline = groups.iter().find(|group| group.eta == 1.0);
+                let rows = groups.iter().map(|group| Row {
+                    eta: group.eta,
+                    seeds: group.runs.len(),
+                    failures: group.failures(),
+                    cells: COLUMNS.iter().map(|column| (column.compute)(group, baseline)).collect(),
+                });
+                World {
+                    name: groups[0].env.to_owned(),
+                    rows: rows.collect(),
+                    episodes: episodes(groups),
+                    checks: checks(groups),
+                }
+            })
+            .collect();
+        let mut notes: Vec<String> = runs.runs.iter().flat_map(warnings).collect();
+        notes.extend(runs.notes.iter().cloned());
+        let fewest = groups.iter().map(|group| group.runs.len()).min().unwrap_or_default();
+        if fewest == 1 {
+            notes.push(
+                "Rows of one seed have no interval: nobody knows how seeds differ.".to_owned(),
+            );
+        } else if fewest < FEW_SEEDS {
+            notes.push(format!(
+                "Intervals of rows with {fewest} seeds are too narrow: a nominal 95 % bootstrap interval \
+                 of a mean covers about 75 % with 3 seeds, 90 % with 10. That of gain, a Student t \
+                 interval, keeps its 95 %."
+            ));
+        }
+        Table { worlds, notes }
+    }
+}
+
+/// What is wrong with a run.
+fn warnings(run: &Run) -> Vec<String> {
+    let mut warnings = Vec::new();
+    let name = run.name();
+    if let Some(failure) = &run.failure {
+        let counted = if run.evaluation.is_some() {
+            "Its evaluation counts all the same."
+        } else {
+            "It has no returns: means are over the other seeds, but IQM, worst seed and P(better) \
+             rank it below all."
+        };
+        warnings.push(format!("FAILED: {name} ({failure}). {counted}"));
+    }
+    if let Some(audit) = run.evaluation.as_ref().and_then(|evaluation| evaluation.audit)
+        && audit.violations > 0
+    {
+        warnings.push(format!(
+            "BUDGET VIOLATED: {name}, {} times in {} trajectories (largest use {:.6} of the budget): \
+             its game value proves nothing.",
+            audit.violations, audit.trajectories, audit.max_budget_use
+        ));
+    }
+    if let Some((slack, error)) = slack(run)
+        && leaks(slack, error)
+    {
+        warnings.push(format!(
+            "BUDGET LEAKS: {name}, its game value lies {:.4} (standard error {error:.4}) below the \
+             sampled CVaR_1/eta, which no admissible antagonist can do.",
+            -slack
+        ));
+    }
+    warnings
+}
+
+/// Game value minus sampled CVaR_1/eta of a run with an antagonist, and its standard error.
+fn slack(run: &Run) -> Option<(f64, f64)> {
+    let nominal = run.law(Mode::Sampled, Chance::Nominal).filter(|_| run.eta > 1.0)?;
+    let game = run.game_law(Mode::Sampled)?;
+    let slack = game.mean() - statistics::cvar(nominal, run.alpha())?;
+    Some((slack, game.mean_standard_error().hypot(nominal.cvar_standard_error(run.alpha()))))
+}
+
+fn leaks(slack: f64, error: f64) -> bool {
+    slack < -LEAK_ERRORS * error - 1e-9
+}
+
+/// The audits and the bound over all runs of a world, in words.
+fn checks(groups: &[Group]) -> String {
+    let runs = || groups.iter().flat_map(|group| group.runs);
+    let mut checks = String::new();
+    let audits: Vec<Audit> = runs().filter_map(|run| run.evaluation.as_ref()?.audit).collect();
+    if !audits.is_empty() {
+        let trajectories = audits.iter().map(|audit| audit.trajectories).sum();
+        let violations: u64 = audits.iter().map(|audit| audit.violations).sum();
+        let most = audits.iter().map(|audit| audit.max_budget_use).fold(0.0, f64::max);
+        checks += &format!(
+            "Budget audit: {} violations in {} trajectories, largest use {most:.6} of the budget. ",
+            thousands(violations),
+            thousands(trajectories)
+        );
+    }
+    let slacks: Vec<(f64, f64)> = runs().filter_map(slack).collect();
+    if !slacks.is_empty() {
+        let kept = slacks.iter().filter(|(slack, error)| !leaks(*slack, *error)).count();
+        let least = slacks.iter().map(|(slack, _)| *slack).fold(f64::INFINITY, f64::min);
+        checks += &format!(
+            "Bound: game value not below the sampled CVaR_1/eta beyond sampling error in {kept} of {} \
+             runs (least difference {least:.4}).",
+            slacks.len()
+        );
+    }
+    checks.trim_end().to_owned()
+}
+
+/// What the laws of a world's runs rest on, kind by kind.
+fn episodes(groups: &[Group]) -> String {
+    let kinds = [
+        ("greedy", Mode::Greedy, Chance::Nominal),
+        ("sampled", Mode::Sampled, Chance::Nominal),
+        ("greedy under antagonist", Mode::Greedy, Chance::Antagonist),
+        ("sampled under antagonist", Mode::Sampled, Chance::Antagonist),
+    ];
+    let said = |count: Option<u64>| count.map_or("exact law".to_owned(), thousands);
+    let parts = kinds.into_iter().filter_map(|(name, mode, chance)| {
+        let runs = groups.iter().flat_map(|group| group.runs);
+        let counts: Vec<Option<u64>> =
+            runs.filter_map(|run| run.law(mode, chance)).map(ReturnLaw::episodes).collect();
+        let (least, most) = (*counts.iter().min()?, *counts.iter().max()?);
+        let range = if least == most { String::new() } else { format!("{} to ", said(least)) };
+        Some(format!("{name} {range}{}", said(most)))
+    });
+    format!("Episodes per run: {}", parts.collect::<Vec<String>>().join(", "))
+}
+
+/// A whole number with separators: 100,000.
+fn thousands(number: u64) -> String {
+    let digits = number.to_string();
+    let mut text = String::new();
+    for (place, digit) in digits.chars().enumerate() {
+        if place > 0 && (digits.len() - place).is_multiple_of(3) {
+            text.push(',');
+        }
+        text.push(digit);
+    }
+    text
+}
