@@ -18,6 +18,7 @@ const PYTORCH_FOLDER: &str =
 
 fn main() {
     println!("cargo::rerun-if-changed=build.rs");
+    tell_the_commit();
     if env::var_os("CARGO_FEATURE_TORCH").is_none() {
         return;
     }
@@ -79,4 +80,22 @@ fn pytorch_folder() -> Result<PathBuf, String> {
 /// Whether libtorch's libraries have other names than on Linux; run paths are then the user's.
 fn on_other_platform() -> bool {
     env::var("CARGO_CFG_TARGET_OS").is_ok_and(|os| os != "linux")
+}
+
+/// Gives the program the commit that it is built from, for the manifests of runs.
+fn tell_the_commit() {
+    let git = |arguments: &[&str]| {
+        let output = Command::new("git").args(arguments).output().ok()?;
+        let text = String::from_utf8(output.stdout).ok()?;
+        output.status.success().then(|| text.trim().to_owned())
+    };
+    // The log of HEAD grows with every commit and checkout.
+    if let Some(log) = git(&["rev-parse", "--git-path", "logs/HEAD"])
+        && Path::new(&log).exists()
+    {
+        println!("cargo::rerun-if-changed={log}");
+    }
+    if let Some(commit) = git(&["rev-parse", "HEAD"]) {
+        println!("cargo::rustc-env=CVAR_GAME_COMMIT={commit}");
+    }
 }

@@ -315,11 +315,13 @@ fn train(args: &TrainArgs) -> Result<ExitCode> {
     let config = args.overrides.resolve(args.config.as_deref(), options)?;
     let id = plan::runs(&config)[0];
     let prepared = prepare(&config, &args.out)?;
-    if !prepared.finished.is_empty() {
+    let outcome = if prepared.todo.is_empty() {
         eprintln!("{id} has finished before; remove its folder to run it again");
-    }
-    Stop::by_ending_the_process().context("cannot listen to signals")?;
-    let outcome = sweep(&prepared, NonZeroUsize::MIN, &InProcess, &Stop::default());
+        Outcome::default()
+    } else {
+        Stop::by_ending_the_process().context("cannot listen to signals")?;
+        sweep(&prepared, NonZeroUsize::MIN, &InProcess, &Stop::default())
+    };
     let folder = id.folder(&args.out);
     let code = tell_failures(&outcome);
     match runner::read_evaluation(&folder)? {

@@ -257,19 +257,6 @@ mod runs {
         }
     }
 
-    #[test]
-    fn the_numbers_do_not_depend_on_the_number_of_jobs() {
-        let folder = tempfile::tempdir().unwrap();
-        let config = config_file(&folder, SMALL);
-        let weights = ["1", "2"].map(|jobs| {
-            let out = folder.path().join(jobs);
-            answer(&["bench", "--config", &config, "--jobs", jobs, "--out", out.to_str().unwrap()]);
-            ["lava-grid/eta-25", "lava-point/eta-25"]
-                .map(|run| fs::read(out.join(run).join("seed-1/final.safetensors")).unwrap())
-        });
-        assert!(weights[0] == weights[1], "the weights differ");
-    }
-
     /// A sweep of endless runs, once its workers are at work.
     fn endless(folder: &TempDir, out: &Path) -> Child {
         let config = config_file(folder, SMALL);

@@ -36,7 +36,8 @@ fn the_default_is_the_papers_experiment() {
         assert_eq!(train.steps, 5_000_000);
         assert_eq!(train.parallel_episodes * train.rollout_steps, 10_000);
         assert_eq!(train.follower_updates, 2);
-        assert_eq!((train.budget_wait, train.budget_rise), (0.0, 0.0));
+        // The point mass needs time to find the goal before the antagonist wakes.
+        assert_eq!(train.budget_wait > 0.0, world == WorldName::LavaPoint);
     }
 }
 

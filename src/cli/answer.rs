@@ -6,6 +6,8 @@ use cvar_game::experiment::artefacts::{Chance, Evaluation, Mode};
 use cvar_game::experiment::{artefacts::Play, plan::RunId};
 use cvar_game::game::budget::Eta;
 #[cfg(feature = "torch")]
+use cvar_game::game::returns::ReturnLaw;
+#[cfg(feature = "torch")]
 use lava_envs::End;
 use serde::Serialize;
 use std::fmt::{self, Display};
@@ -133,6 +135,8 @@ struct PlaySummary {
     lava: f64,
     goal: f64,
     timeout: f64,
+    /// The law of the return itself, atom by atom.
+    law: ReturnLaw,
 }
 
 #[cfg(feature = "torch")]
@@ -147,6 +151,7 @@ impl Plays {
             lava: play.law.probability(End::Lava),
             goal: play.law.probability(End::Goal),
             timeout: play.law.probability(End::Timeout),
+            law: play.law.clone(),
         };
         Plays { run: run.to_string(), plays: plays.iter().map(summary).collect() }
     }

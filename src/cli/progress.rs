@@ -89,14 +89,18 @@ impl Bars {
         match event {
             Event::Started { run, steps } => {
                 let bar = self.all.insert_before(&self.sweep, ProgressBar::new(*steps));
-                bar.set_style(style("{prefix} [{bar:30}] {percent:>3} % {per_sec} {msg}"));
+                bar.set_style(style("{prefix} [{bar:30}] {percent:>3} % {msg}"));
                 bar.set_prefix(run.to_string());
                 self.active.push((*run, bar));
             }
             Event::Ticked { run, tick } => {
                 if let Some((_, bar)) = self.active.iter().find(|(active, _)| active == run) {
                     bar.set_position(tick.steps);
-                    bar.set_message(format!("return {:+.3}", tick.mean_return));
+                    bar.set_message(format!(
+                        "{:.0} steps/s, return {:+.3}",
+                        bar.per_sec(),
+                        tick.mean_return
+                    ));
                 }
             }
             Event::Finished { run, .. } | Event::Failed { run, .. } | Event::Stopped { run } => {
@@ -106,7 +110,7 @@ impl Bars {
                     }
                     active != run
                 });
-                self.sweep.inc(1);
+                self.sweep.inc(u64::from(!matches!(event, Event::Stopped { .. })));
             }
         }
     }

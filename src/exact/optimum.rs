@@ -82,7 +82,8 @@ pub fn optimum(mdp: &FiniteMdp, alpha: f64) -> Result<Optimum, ExactError> {
             });
         }
     }
-    best.ok_or(ExactError::TooLarge)
+    // The search keeps at least the best threshold it saw.
+    best.ok_or(ExactError::Alpha(alpha))
 }
 
 /// Candidates between two evaluated ones (positions among the returns), and the best F they may have.

@@ -10,6 +10,7 @@
 //! | `final.safetensors` | weights of both players at the end, never the best |
 //! | `evaluation.json` | [`Evaluation`]; written last, so that a run with it is finished |
 
+use super::config::RunConfig;
 use crate::game::returns::ReturnLaw;
 use serde::{Deserialize, Serialize};
 use std::io::{self, Write};
@@ -27,9 +28,9 @@ pub struct Manifest {
     pub run: String,
     /// Version of the program.
     pub version: String,
-    /// Commit of the source, if built in a checkout; `+` marks local changes.
+    /// Commit of the source, if the program was built in a checkout.
     pub commit: Option<String>,
-    /// Version of libtorch.
+    /// Version of libtorch: the one that tch is made for, as its build refuses any other.
     pub libtorch: String,
     /// Device of the networks.
     pub device: String,
@@ -41,6 +42,31 @@ pub struct Manifest {
     pub steps: u64,
     /// Set when the run failed; says at which update, which player and which quantity.
     pub failure: Option<String>,
+}
+
+impl Manifest {
+    /// The manifest of a run of this program on this machine.
+    pub fn of(run: &RunConfig, steps: u64, seconds: f64) -> Self {
+        Manifest {
+            schema: SCHEMA,
+            run: run.id().to_string(),
+            version: env!("CARGO_PKG_VERSION").to_owned(),
+            commit: option_env!("CVAR_GAME_COMMIT").map(str::to_owned),
+            libtorch: "2.13.0".to_owned(),
+            device: run.device.to_string(),
+            cpu: processor(),
+            seconds,
+            steps,
+            failure: None,
+        }
+    }
+}
+
+/// Model name of the processor, where the system tells.
+fn processor() -> String {
+    let text = std::fs::read_to_string("/proc/cpuinfo").unwrap_or_default();
+    let model = text.lines().find_map(|line| line.strip_prefix("model name"));
+    model.map_or("unknown", |name| name.trim_start_matches([' ', '\t', ':'])).to_owned()
 }
 
 /// How a protagonist picks its action.

@@ -57,6 +57,16 @@ pub trait Yardstick: Arena + Sized {
 /// Slack of the audit: rounding of forty factors, and of the normalisation.
 const TOLERANCE: f64 = 1e-6;
 
+/// What the protocol finds of a pair.
+pub struct Findings {
+    /// Greedy and sampled, nominal and (eta > 1) antagonist.
+    pub plays: Vec<Play>,
+    /// The budget audit; `None` at eta = 1.
+    pub audit: Option<Audit>,
+    /// Certificates where the world has a yardstick.
+    pub certificate: Option<Certificate>,
+}
+
 /// All plays of the protocol, the budget audit and the certificate.
 ///
 /// # Errors
@@ -65,7 +75,7 @@ pub fn protocol<W: Yardstick>(
     run: &RunConfig,
     constants: &W::Constants,
     pair: &Pair<W>,
-) -> Result<(Vec<Play>, Option<Audit>, Option<Certificate>), RunError> {
+) -> Result<Findings, RunError> {
     let antagonist = pair.antagonist.is_some();
     // Nominal episodes of the sampled protagonist also carry the antagonist's ratios, for the audit.
     let nominal = if antagonist { contest::Chance::Shadowed } else { contest::Chance::Nominal };
@@ -84,7 +94,7 @@ pub fn protocol<W: Yardstick>(
         audit = Some(budget_audit(run, &[&greedy, &sampled, &weighted])?);
     }
     let certificate = W::certify(constants, run, pair, &mut plays)?;
-    Ok((plays, audit, certificate))
+    Ok(Findings { plays, audit, certificate })
 }
 
 fn play_episodes<W: Yardstick>(
@@ -290,8 +300,9 @@ fn policy_of(
             pair.views.protagonist(&world, 0, row);
         }
         pair.protagonist.network.act(&inputs, &mut outputs);
-        let logits = outputs.as_chunks::<MOVES>().0;
-        logits.iter().map(|l| CategoricalPolicy::probabilities(&l.map(f64::from))).collect()
+        let logits =
+            |cell| std::array::from_fn::<_, MOVES, _>(|i| f64::from(outputs[i * cells + cell]));
+        (0..cells).map(|cell| CategoricalPolicy::probabilities(&logits(cell))).collect()
     };
     if pair.views.protagonist_sees_time() {
         let tables: Vec<_> = (0..horizon).map(at_time).collect();

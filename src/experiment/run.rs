@@ -10,7 +10,6 @@ use crate::learn::pair::Pair;
 use crate::learn::train::{Game, Progress, TrainError, train};
 use crate::learn::weights::{self, WeightsError};
 use lava_envs::{LavaGrid, LavaPoint};
-use std::collections::HashMap;
 use std::fs::File;
 use std::io::{self, BufWriter, Write};
 use std::path::Path;
@@ -107,20 +106,16 @@ fn carry_out<W: Yardstick>(
     let seconds = start.elapsed().as_secs_f64();
     written.and_then(|()| progress.finish()).map_err(RunError::file(&path))?;
 
-    let mut manifest = manifest(run, seconds, last.steps);
+    let mut manifest = Manifest::of(run, last.steps, seconds);
     manifest.failure = trained.as_ref().err().map(ToString::to_string);
     write_json(&folder.join("manifest.json"), &manifest)?;
     let pair = trained?;
 
     let path = folder.join("final.safetensors");
-    let metadata = HashMap::from([
-        ("schema".to_owned(), SCHEMA.to_string()),
-        ("run".to_owned(), manifest.run),
-        ("steps".to_owned(), last.steps.to_string()),
-    ]);
-    write_in_place(&path, &weights::to_bytes(&pair, metadata)?).map_err(RunError::file(&path))?;
+    let about = format!("schema {SCHEMA}, run {}, steps {}", manifest.run, last.steps);
+    write_in_place(&path, &weights::to_bytes(&pair, about)?).map_err(RunError::file(&path))?;
 
-    let (plays, audit, certificate) = evaluation::protocol(run, constants, &pair)?;
+    let found = evaluation::protocol(run, constants, &pair)?;
     let evaluation = Evaluation {
         schema: SCHEMA,
         env: run.env.name().to_string(),
@@ -128,9 +123,9 @@ fn carry_out<W: Yardstick>(
         seed: run.seed,
         steps: last.steps,
         seconds,
-        plays,
-        audit,
-        certificate,
+        plays: found.plays,
+        audit: found.audit,
+        certificate: found.certificate,
     };
     write_json(&folder.join("evaluation.json"), &evaluation)
 }
@@ -153,33 +148,6 @@ fn device(device: Device) -> tch::Device {
         Device::Cpu => tch::Device::Cpu,
         Device::Cuda(number) => tch::Device::Cuda(number),
     }
-}
-
-fn manifest(run: &RunConfig, seconds: f64, steps: u64) -> Manifest {
-    Manifest {
-        schema: SCHEMA,
-        run: run.id().to_string(),
-        version: env!("CARGO_PKG_VERSION").to_owned(),
-        commit: option_env!("CVAR_GAME_COMMIT").map(str::to_owned),
-        libtorch: libtorch_version(),
-        device: run.device.to_string(),
-        cpu: cpu(),
-        seconds,
-        steps,
-        failure: None,
-    }
-}
-
-/// The version of libtorch that tch is made for; its build refuses any other.
-fn libtorch_version() -> String {
-    "2.13.0".to_owned()
-}
-
-/// Model name of the processor, where the system tells.
-fn cpu() -> String {
-    let text = std::fs::read_to_string("/proc/cpuinfo").unwrap_or_default();
-    let model = text.lines().find_map(|line| line.strip_prefix("model name"));
-    model.map_or("unknown", |name| name.trim_start_matches([' ', '\t', ':'])).to_owned()
 }
 
 fn write_json(path: &Path, value: &impl serde::Serialize) -> Result<(), RunError> {

@@ -409,18 +409,7 @@ fn record_failure(
 ) -> io::Result<()> {
     let path = folder.join("manifest.json");
     let written = fs::read(&path).ok().and_then(|bytes| serde_json::from_slice(&bytes).ok());
-    let mut manifest = written.unwrap_or_else(|| Manifest {
-        schema: SCHEMA,
-        run: run.id().to_string(),
-        version: env!("CARGO_PKG_VERSION").to_owned(),
-        commit: None,
-        libtorch: "unknown".to_owned(),
-        device: run.device.to_string(),
-        cpu: "unknown".to_owned(),
-        seconds,
-        steps,
-        failure: None,
-    });
+    let mut manifest = written.unwrap_or_else(|| Manifest::of(run, steps, seconds));
     manifest.failure.get_or_insert_with(|| reason.to_owned());
     let mut text = serde_json::to_string_pretty(&manifest)?;
     text.push('\n');

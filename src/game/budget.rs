@@ -109,56 +109,38 @@ impl Budget {
     /// admissible, as a [`Mixing`].
     ///
     /// `1 - lambda = min(1, (eta_t - 1) / (M - 1))`, so that `E_P[delta] = 1` and
-    /// `sup delta = min(M, eta_t)`.
+    /// `sup delta = min(M, eta_t)`. The quotient stays accurate when M is huge; log M must stay below
+    /// 700, which the families' bounds see to.
     pub fn mix(self, log_supremum: f64) -> Mixing {
         let room = self.0 - 1.0;
         let excess = log_supremum.exp_m1(); // M - 1, accurate near M = 1
         if excess <= room {
-            return Mixing { weight: 1.0, log_weight: 0.0, excess: None };
+            Mixing { weight: 1.0, by_log_supremum: 0.0 }
+        } else {
+            let weight = room / excess;
+            Mixing { weight, by_log_supremum: -weight * (1.0 + 1.0 / excess) }
         }
-        // log(M - 1) = log M + log(1 - 1/M) does not overflow where M does.
-        let log_excess = log_supremum + (-(-log_supremum).exp_m1()).ln();
-        let log_weight = room.ln() - log_excess;
-        Mixing { weight: log_weight.exp(), log_weight, excess: Some(excess) }
     }
 }
 
-/// The weight of delta^0 in `delta = lambda + (1 - lambda) delta^0`.
+/// The weight of delta^0 in `delta = lambda + (1 - lambda) delta^0`, and how M moves it.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Mixing {
-    /// 1 - lambda, in [0, 1].
+    /// rho = 1 - lambda, in [0, 1].
     pub weight: f64,
-    log_weight: f64,
-    /// M - 1 where the budget binds, else `None` and the weight is 1.
-    excess: Option<f64>,
+    /// d rho / d log M: -rho M / (M - 1) where the budget binds, else 0.
+    pub by_log_supremum: f64,
 }
 
 impl Mixing {
-    /// delta(o), from log delta^0(o).
-    pub fn likelihood_ratio(&self, log_base: f64) -> f64 {
-        (1.0 - self.weight) + self.weighted(log_base)
+    /// delta(o), from delta^0(o).
+    pub fn likelihood_ratio(&self, base: f64) -> f64 {
+        (1.0 - self.weight) + self.weight * base
     }
 
-    /// (1 - lambda) delta^0(o), from log delta^0(o).
-    pub fn weighted(&self, log_base: f64) -> f64 {
-        (self.log_weight + log_base).exp()
-    }
-
-    /// Derivatives of delta(o) by log delta^0(o) and by log M, gradients flowing through lambda.
-    ///
-    /// With rho = 1 - lambda: d delta = rho delta^0 dlog delta^0 + (delta^0 - 1) d rho, where
-    /// d rho = -rho M / (M - 1) dlog M if the budget binds, else 0.
-    pub fn derivatives(&self, log_base: f64) -> (f64, f64) {
-        let weighted = self.weighted(log_base);
-        let by_log_supremum = match self.excess {
-            Some(excess) => -(weighted - self.weight) * (1.0 + 1.0 / excess),
-            None => 0.0,
-        };
-        (weighted, by_log_supremum)
-    }
-
-    /// Derivative of the weight 1 - lambda by log M.
-    pub fn weight_derivative(&self) -> f64 {
-        self.excess.map_or(0.0, |excess| -self.weight * (1.0 + 1.0 / excess))
+    /// Derivatives of delta(o) by log delta^0(o) and by log M, gradients flowing through lambda:
+    /// d delta = rho delta^0 dlog delta^0 + (delta^0 - 1) d rho.
+    pub fn derivatives(&self, base: f64) -> (f64, f64) {
+        (self.weight * base, (base - 1.0) * self.by_log_supremum)
     }
 }

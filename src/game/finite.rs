@@ -14,8 +14,8 @@ pub struct FiniteFamily;
 #[derive(Debug, Clone)]
 pub struct FinitePerturbation {
     nominal: [f64; MOVES],
-    /// log delta^0; of no meaning where the nominal probability is 0.
-    log_base: [f64; MOVES],
+    /// delta^0; 1 where the nominal probability is 0.
+    base: [f64; MOVES],
     /// The outcome where delta^0 attains M.
     top: usize,
     mixing: Mixing,
@@ -45,21 +45,16 @@ impl Family for FiniteFamily {
                 top = i;
             }
         }
-        let highest = parameters[top];
-        let mut sum = 0.0;
-        for i in 0..MOVES {
-            if nominal[i] > 0.0 {
-                sum += nominal[i] * (parameters[i] - highest).exp();
-            }
-        }
-        let log_sum = sum.ln();
-        let log_base = std::array::from_fn(|i| {
-            if nominal[i] > 0.0 { parameters[i] - highest - log_sum } else { 0.0 }
+        let possible = |i: usize| nominal[i] > 0.0;
+        let weights: [f64; MOVES] = std::array::from_fn(|i| {
+            if possible(i) { (parameters[i] - parameters[top]).exp() } else { 0.0 }
         });
-        let mixing = budget.mix(log_base[top]);
-        let ratio = std::array::from_fn(|i| mixing.likelihood_ratio(log_base[i]));
+        let sum: f64 = (0..MOVES).map(|i| nominal[i] * weights[i]).sum();
+        let base = std::array::from_fn(|i| if possible(i) { weights[i] / sum } else { 1.0 });
+        let mixing = budget.mix(-sum.ln());
+        let ratio = base.map(|base| mixing.likelihood_ratio(base));
         let perturbed = std::array::from_fn(|i| nominal[i] * ratio[i]);
-        FinitePerturbation { nominal, log_base, top, mixing, ratio, perturbed }
+        FinitePerturbation { nominal, base, top, mixing, ratio, perturbed }
     }
 }
 
@@ -72,14 +67,12 @@ impl FinitePerturbation {
     /// Adds `weight * d delta_i / d logits` to the gradient. With q^0 = P delta^0:
     /// dlog delta^0_i / d logit_k = [i = k] - q^0_k, and the same at the top for log M.
     fn add_ratio_gradient(&self, i: usize, weight: f64, gradient: &mut [f64]) {
-        let (by_base, by_supremum) = self.mixing.derivatives(self.log_base[i]);
+        let (by_base, by_supremum) = self.mixing.derivatives(self.base[i]);
         gradient[i] += weight * by_base;
         gradient[self.top] += weight * by_supremum;
-        for (k, entry) in gradient.iter_mut().enumerate() {
-            if self.nominal[k] > 0.0 {
-                let base = self.nominal[k] * self.log_base[k].exp();
-                *entry -= weight * (by_base + by_supremum) * base;
-            }
+        for (entry, (nominal, base)) in gradient.iter_mut().zip(self.nominal.iter().zip(self.base))
+        {
+            *entry -= weight * (by_base + by_supremum) * nominal * base;
         }
     }
 }

@@ -137,10 +137,10 @@ impl GaussianPerturbation {
         self.mixing.weight
     }
 
-    /// log delta^0(xi) = log M - 1/2 (xi-c)' K (xi-c).
-    fn log_base(&self, xi: Vector2<f64>) -> f64 {
+    /// delta^0(xi) = M exp(-1/2 (xi-c)' K (xi-c)).
+    fn base(&self, xi: Vector2<f64>) -> f64 {
         let off = xi - self.center.value;
-        self.log_supremum - 0.5 * off.dot(&(self.curvature * off))
+        (self.log_supremum - 0.5 * off.dot(&(self.curvature * off))).exp()
     }
 
     /// Gradients of log M by c, which is c - S c (as K S = I - S), and by K, which is
@@ -174,11 +174,11 @@ impl Perturbation for GaussianPerturbation {
     type Law = GaussianLaw;
 
     fn likelihood_ratio(&self, xi: Vector2<f64>) -> f64 {
-        self.mixing.likelihood_ratio(self.log_base(xi))
+        self.mixing.likelihood_ratio(self.base(xi))
     }
 
     fn supremum(&self) -> f64 {
-        self.mixing.likelihood_ratio(self.log_supremum)
+        self.mixing.likelihood_ratio(self.log_supremum.exp())
     }
 
     /// A draw from the mixture lambda N(0, I) + (1 - lambda) N(m, S).
@@ -189,9 +189,9 @@ impl Perturbation for GaussianPerturbation {
     }
 
     fn score(&self, xi: Vector2<f64>, gradient: &mut [f64]) {
-        let log_base = self.log_base(xi);
-        let (by_base, by_supremum) = self.mixing.derivatives(log_base);
-        let ratio = self.mixing.likelihood_ratio(log_base);
+        let base = self.base(xi);
+        let (by_base, by_supremum) = self.mixing.derivatives(base);
+        let ratio = self.mixing.likelihood_ratio(base);
         let (supremum_center, supremum_curvature) = self.log_supremum_gradient();
         let off = xi - self.center.value;
         // log delta^0 = log M - 1/2 (xi-c)' K (xi-c), so log M enters on both ways.
@@ -210,7 +210,7 @@ impl Perturbation for GaussianPerturbation {
     fn entropy(&self, gradient: &mut [f64]) -> f64 {
         let log_determinant = -self.covariance.determinant().ln(); // log|I+K|
         let (supremum_center, supremum_curvature) = self.log_supremum_gradient();
-        let by_supremum = -0.5 * log_determinant * self.mixing.weight_derivative();
+        let by_supremum = -0.5 * log_determinant * self.mixing.by_log_supremum;
         self.pull_back(
             supremum_center * by_supremum,
             // d log|I+K| / dK = S

@@ -125,7 +125,9 @@ impl ReturnLaw {
 
     /// Probability that an episode ends so.
     pub fn probability(&self, end: End) -> f64 {
-        self.atoms.iter().filter(|atom| atom.end == end).map(|atom| atom.mass).sum()
+        let ending = self.atoms.iter().filter(|atom| atom.end == end);
+        // An empty sum of floats is -0.
+        ending.map(|atom| atom.mass).sum::<f64>() + 0.0
     }
 
     /// Mean number of steps of the episodes that reach the goal; `None` if none does.

@@ -74,7 +74,7 @@ pub struct Contest<W: Arena> {
     pub antagonist_inputs: Vec<f32>,
     /// Chosen actions.
     pub actions: Vec<W::Action>,
-    /// Actor outputs of the protagonist, shape `[slots, k]`.
+    /// Actor outputs of the protagonist, shape `[k, slots]`.
     pub protagonist_outputs: Vec<f32>,
     /// Nominal laws P_t.
     pub laws: Vec<W::Law>,
@@ -215,9 +215,10 @@ pub fn parameters_of<H: Head>(
     outputs: &[f32],
     slot: usize,
 ) -> [f64; MAX_PARAMETERS] {
-    let k = player.network.shape().outputs;
+    let slots = outputs.len() / player.network.shape().outputs;
     let mut parameters = [0.0; MAX_PARAMETERS];
-    let numbers = outputs[slot * k..(slot + 1) * k].iter().chain(player.network.constants());
+    let outputs = outputs.iter().skip(slot).step_by(slots);
+    let numbers = outputs.chain(player.network.constants());
     for (parameter, &number) in parameters.iter_mut().zip(numbers) {
         *parameter = f64::from(number);
     }

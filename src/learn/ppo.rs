@@ -148,7 +148,7 @@ impl<H: Head> Player<H> {
             })
             .collect();
 
-        let row = self.network.shape().row();
+        let row = self.network.shape().width();
         let mut order: Vec<usize> = (0..samples.len()).collect();
         let mut losses = Losses {
             explained_variance: explained_variance(&samples, &values),
@@ -185,8 +185,8 @@ impl<H: Head> Player<H> {
 
 /// The loss of a minibatch and its gradient.
 ///
-/// `y` has a row per sample, the actor's outputs and the value, and is overwritten by the gradient;
-/// `by_constants` receives the gradient by the head's constants.
+/// `y`, shape `[k + 1, n]`, holds the actor's outputs and below them the values, and is overwritten by
+/// the gradient; `by_constants` receives the gradient by the head's constants.
 pub fn loss<H: Head>(
     head: &H,
     samples: &[Sample<H>],
@@ -212,10 +212,12 @@ pub fn loss<H: Head>(
     let mut by_entropy = [0.0; MAX_PARAMETERS];
     let mut constants_gradient = [0.0; MAX_PARAMETERS];
     let mut losses = Losses::default();
-    for (sample, row) in samples.iter().zip(y.chunks_exact_mut(outputs + 1)) {
-        for (parameter, &output) in parameters.iter_mut().zip(&row[..outputs]) {
-            *parameter = f64::from(output);
+    let n = samples.len();
+    for (column, sample) in samples.iter().enumerate() {
+        for i in 0..outputs {
+            parameters[i] = f64::from(y[i * n + column]);
         }
+        let value = &mut y[outputs * n + column];
         let (log_probability, entropy) = head.gradients(
             &parameters[..count],
             &sample.given,
@@ -231,7 +233,8 @@ pub fn loss<H: Head>(
         // Where the clipped branch is the smaller one it is constant in the parameters.
         let by_log_probability =
             if ratio * advantage <= clipped * advantage { -share * ratio * advantage } else { 0.0 };
-        let error = f64::from(row[outputs]) - f64::from(sample.target);
+        let error = f64::from(*value) - f64::from(sample.target);
+        *value = (2.0 * options.value_coefficient * share * error) as f32;
 
         losses.policy_loss -= share * surrogate;
         losses.value_loss += share * error * error;
@@ -241,13 +244,12 @@ pub fn loss<H: Head>(
 
         let gradient =
             |i: usize| by_log_probability * score[i] - share * entropy_weight * by_entropy[i];
-        for (i, output) in row[..outputs].iter_mut().enumerate() {
-            *output = gradient(i) as f32;
+        for i in 0..outputs {
+            y[i * n + column] = gradient(i) as f32;
         }
-        for i in 0..constants.len() {
-            constants_gradient[i] += gradient(outputs + i);
+        for (i, sum) in constants_gradient[..constants.len()].iter_mut().enumerate() {
+            *sum += gradient(outputs + i);
         }
-        row[outputs] = (2.0 * options.value_coefficient * share * error) as f32;
     }
     for (slot, value) in by_constants.iter_mut().zip(constants_gradient) {
         *slot = value as f32;

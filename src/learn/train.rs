@@ -165,7 +165,7 @@ pub fn schedule(options: &TrainOptions, eta: Eta) -> Vec<Turn> {
         };
         let progress = done[index] as f64 / (totals[index] as f64 - 1.0).max(1.0);
         done[index] += 1;
-        let between = |first: f64, last: f64| first + (last - first) * progress;
+        let between = |first: f64, last: f64| first * (1.0 - progress) + last * progress;
         let rates = Rates {
             learning_rate: between(player.learning_rate, player.learning_rate_final),
             entropy: between(player.entropy, player.entropy_final),

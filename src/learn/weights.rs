@@ -38,14 +38,11 @@ pub enum WeightsError {
     },
 }
 
-/// The players as the bytes of a safetensors file, with `metadata` in its header.
+/// The players as the bytes of a safetensors file, with `about` in its header.
 ///
 /// # Errors
 /// If the format refuses a tensor.
-pub fn to_bytes<W: Arena>(
-    pair: &Pair<W>,
-    metadata: HashMap<String, String>,
-) -> Result<Vec<u8>, WeightsError> {
+pub fn to_bytes<W: Arena>(pair: &Pair<W>, about: String) -> Result<Vec<u8>, WeightsError> {
     let mut tensors = BTreeMap::new();
     let mut add = |role: Role, network: &Network| {
         for (name, tensor) in layout(role, network.shape()) {
@@ -64,6 +61,8 @@ pub fn to_bytes<W: Arena>(
             TensorView::new(Dtype::F32, shape.clone(), bytes).map(|view| (name, view))
         })
         .collect::<Result<Vec<_>, _>>()?;
+    // One entry: the header of several would follow the random order of a hash map.
+    let metadata = HashMap::from([("cvar-game".to_owned(), about)]);
     Ok(safetensors::serialize(views, Some(metadata))?)
 }
 
@@ -113,45 +112,38 @@ fn restore<H: Head>(
     Ok(())
 }
 
-/// Where a tensor's entries lie in the flat parameters: entry (i, j) at
-/// `start + i * strides[0] + j * strides[1]`.
+/// Where a tensor's entries lie in the flat parameters: row i at `start + i * stride`.
 struct Place {
     shape: Vec<usize>,
     start: usize,
-    strides: [usize; 2],
+    stride: usize,
 }
 
 impl Place {
     fn indices(&self) -> impl Iterator<Item = usize> + '_ {
-        let (rows, columns) = match self.shape[..] {
-            [rows, columns] => (rows, columns),
-            _ => (self.shape[0], 1),
-        };
-        let [down, across] = self.strides;
-        (0..rows).flat_map(move |i| (0..columns).map(move |j| self.start + i * down + j * across))
+        let columns = self.shape.get(1).copied().unwrap_or(1);
+        (0..self.shape[0])
+            .flat_map(move |i| (0..columns).map(move |j| self.start + i * self.stride + j))
     }
 }
 
-/// All tensors of a player. See [`crate::learn::network`] for the flat layout `[W | V | b | c]`.
+/// All tensors of a player, out of the flat layout of [`crate::learn::network`].
 fn layout(role: Role, shape: Shape) -> Vec<(String, Place)> {
     let Shape { inputs, hidden, outputs, constants } = shape;
-    let (wide, columns) = (2 * hidden, outputs + 1);
-    let second = (inputs + 1) * wide;
-    let bias = second + wide * columns;
     let mut places = Vec::new();
-    let mut add = |name: &str, shape: Vec<usize>, start, strides| {
-        places.push((format!("{role}.{name}"), Place { shape, start, strides }));
+    let mut add = |name: &str, shape: Vec<usize>, start, stride| {
+        places.push((format!("{role}.{name}"), Place { shape, start, stride }));
     };
-    for (net, half, first_column, count) in [("actor", 0, 0, outputs), ("critic", 1, outputs, 1)] {
-        let unit = half * hidden;
-        add(&format!("{net}.hidden.weight"), vec![hidden, inputs], unit, [1, wide]);
-        add(&format!("{net}.hidden.bias"), vec![hidden], inputs * wide + unit, [1, 0]);
-        let start = second + unit * columns + first_column;
-        add(&format!("{net}.output.weight"), vec![count, hidden], start, [1, columns]);
-        add(&format!("{net}.output.bias"), vec![count], bias + first_column, [1, 0]);
+    for (net, unit, row, rows) in [("actor", 0, 0, outputs), ("critic", hidden, outputs, 1)] {
+        let width = shape.width();
+        add(&format!("{net}.hidden.weight"), vec![hidden, inputs], shape.first_at(unit, 0), width);
+        add(&format!("{net}.hidden.bias"), vec![hidden], shape.first_at(unit, inputs), width);
+        let (start, wide) = (shape.second_at(row, unit), 2 * hidden);
+        add(&format!("{net}.output.weight"), vec![rows, hidden], start, wide);
+        add(&format!("{net}.output.bias"), vec![rows], shape.bias_at() + row, 1);
     }
     if constants > 0 {
-        add("actor.constants", vec![constants], bias + columns, [1, 0]);
+        add("actor.constants", vec![constants], shape.constants_at(), 1);
     }
     places
 }

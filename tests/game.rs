@@ -1,0 +1,265 @@
+//! The game against independent truth: quadrature, finite differences, and trajectories in both
+//! worlds.
+
+use approx::assert_relative_eq;
+use cvar_game::game::budget::{Budget, Eta};
+use cvar_game::game::finite::FiniteFamily;
+use cvar_game::game::gaussian::GaussianFamily;
+use cvar_game::game::perturbation::{Family, Perturbation};
+use lava_envs::{FiniteLaw, GaussianLaw, Law};
+use nalgebra::{Matrix2, Vector2};
+use proptest::prelude::*;
+use rand::SeedableRng;
+use rand::rngs::ChaCha8Rng;
+
+const FAMILY: GaussianFamily = GaussianFamily { center_bound: 4.0, curvature_bound: 50.0 };
+
+fn budget(eta: f64) -> Budget {
+    Budget::start(Eta::new(eta).unwrap())
+}
+
+/// Budgets from exactly 1 and barely above to large.
+fn budgets() -> impl Strategy<Value = f64> {
+    prop_oneof![
+        Just(1.0),
+        (1e-12f64..1e-3).prop_map(|x| 1.0 + x),
+        1.0f64..3.0,
+        (1.0f64..12.0).prop_map(f64::exp),
+    ]
+}
+
+fn probabilities() -> impl Strategy<Value = [f64; 4]> {
+    (prop::array::uniform4(0.0f64..1.0), prop::array::uniform4(prop::bool::weighted(0.15)))
+        .prop_map(|(mut weights, absent)| {
+            for i in 0..4 {
+                weights[i] = if absent[i] { 0.0 } else { weights[i] + 1e-3 };
+            }
+            if weights.iter().sum::<f64>() == 0.0 {
+                weights[2] = 1.0;
+            }
+            let sum: f64 = weights.iter().sum();
+            weights.map(|weight| weight / sum)
+        })
+}
+
+/// The integral of f over the plane by Simpson's rule on [-r, r]^2 around a centre.
+fn integrate(f: impl Fn(Vector2<f64>) -> f64, center: Vector2<f64>, r: f64, cells: usize) -> f64 {
+    let h = 2.0 * r / cells as f64;
+    let weight = |i: usize| match i {
+        0 => 1.0,
+        i if i == cells => 1.0,
+        i if i % 2 == 1 => 4.0,
+        _ => 2.0,
+    };
+    let mut sum = 0.0;
+    for i in 0..=cells {
+        for j in 0..=cells {
+            let at = center + Vector2::new(-r + h * i as f64, -r + h * j as f64);
+            sum += weight(i) * weight(j) * f(at);
+        }
+    }
+    sum * h * h / 9.0
+}
+
+/// Central finite differences of `f` at `x`.
+fn differences(f: impl Fn(&[f64]) -> f64, x: &[f64]) -> Vec<f64> {
+    (0..x.len())
+        .map(|i| {
+            let h = 1e-5;
+            let shifted = |by: f64| {
+                let mut x = x.to_vec();
+                x[i] += by;
+                f(&x)
+            };
+            (shifted(h) - shifted(-h)) / (2.0 * h)
+        })
+        .collect()
+}
+
+fn assert_gradient(written: &[f64], numeric: &[f64]) {
+    for (written, numeric) in written.iter().zip(numeric) {
+        let scale = 1.0 + numeric.abs();
+        assert!((written - numeric).abs() < 2e-5 * scale, "{written} against {numeric}");
+    }
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig::with_cases(400))]
+
+    #[test]
+    fn finite_perturbations_are_admissible(
+        logits in prop::array::uniform4(-30.0f64..30.0),
+        p in probabilities(),
+        eta in budgets(),
+    ) {
+        let law = FiniteLaw { probabilities: p };
+        let perturbation = FiniteFamily.perturbation(&logits, &law, budget(eta));
+        let mean: f64 = (0..4).map(|i| p[i] * perturbation.likelihood_ratio(i)).sum();
+        prop_assert!((mean - 1.0).abs() < 1e-9, "E[delta] = {mean}");
+        let supremum = (0..4)
+            .filter(|&i| p[i] > 0.0)
+            .map(|i| perturbation.likelihood_ratio(i))
+            .fold(0.0, f64::max);
+        prop_assert!(supremum <= eta * (1.0 + 1e-9), "sup delta = {supremum} of {eta}");
+        prop_assert!((supremum - perturbation.supremum()).abs() <= 1e-9 * supremum);
+        if eta == 1.0 {
+            prop_assert!((0..4).all(|i| perturbation.likelihood_ratio(i) == 1.0));
+        }
+    }
+
+    #[test]
+    fn gaussian_perturbations_are_admissible(
+        parameters in prop::array::uniform5(-5.0f64..5.0),
+        xi in prop::array::uniform2(-5.0f64..5.0),
+        eta in budgets(),
+    ) {
+        let perturbation = FAMILY.perturbation(&parameters, &GaussianLaw, budget(eta));
+        prop_assert!(perturbation.supremum() <= eta * (1.0 + 1e-9));
+        let ratio = perturbation.likelihood_ratio(Vector2::from(xi));
+        prop_assert!(ratio > 0.0 || eta > 1.0);
+        prop_assert!(ratio <= perturbation.supremum() * (1.0 + 1e-12));
+        prop_assert!(perturbation.normalisation_error() < 1e-9);
+        prop_assert!(perturbation.center().norm() < FAMILY.center_bound);
+        prop_assert!(perturbation.curvature().symmetric_eigenvalues().max() <= FAMILY.curvature_bound);
+        if eta == 1.0 {
+            prop_assert_eq!(ratio, 1.0);
+        }
+    }
+
+    #[test]
+    fn finite_gradients_equal_finite_differences(
+        logits in prop::array::uniform4(-3.0f64..3.0),
+        p in probabilities(),
+        eta in prop_oneof![Just(1.0), 1.05f64..40.0],
+        outcome in 0usize..4,
+    ) {
+        let law = FiniteLaw { probabilities: p };
+        prop_assume!(p[outcome] > 0.0);
+        // Where two logits tie for the top or M meets the budget the derivative jumps.
+        let at = |x: &[f64]| FiniteFamily.perturbation(x, &law, budget(eta));
+        let free = FiniteFamily.perturbation(&logits, &law, budget(1e9));
+        prop_assume!((free.supremum() - eta).abs() > 1e-2);
+        let mut sorted: Vec<f64> = (0..4).filter(|&i| p[i] > 0.0).map(|i| logits[i]).collect();
+        sorted.sort_by(f64::total_cmp);
+        prop_assume!(sorted.len() < 2 || sorted[sorted.len() - 1] - sorted[sorted.len() - 2] > 1e-3);
+
+        let mut gradient = [0.0; 4];
+        at(&logits).score(outcome, &mut gradient);
+        assert_gradient(&gradient, &differences(|x| at(x).likelihood_ratio(outcome).ln(), &logits));
+        at(&logits).entropy(&mut gradient);
+        let entropy = |x: &[f64]| -> f64 {
+            -at(x).probabilities().iter().filter(|&&q| q > 0.0).map(|q| q * q.ln()).sum::<f64>()
+        };
+        assert_gradient(&gradient, &differences(entropy, &logits));
+    }
+
+    #[test]
+    fn gaussian_gradients_equal_finite_differences(
+        parameters in prop::array::uniform5(-2.0f64..2.0),
+        xi in prop::array::uniform2(-3.0f64..3.0),
+        eta in prop_oneof![Just(1.0), 1.05f64..200.0],
+    ) {
+        let at = |x: &[f64]| FAMILY.perturbation(x, &GaussianLaw, budget(eta));
+        let supremum = at(&parameters).log_supremum().exp();
+        prop_assume!((supremum - eta).abs() > 1e-2 * eta);
+        let xi = Vector2::from(xi);
+        let mut gradient = [0.0; 5];
+        at(&parameters).score(xi, &mut gradient);
+        assert_gradient(&gradient, &differences(|x| at(x).likelihood_ratio(xi).ln(), &parameters));
+        let mut scratch = [0.0; 5];
+        at(&parameters).entropy(&mut gradient);
+        assert_gradient(&gradient, &differences(|x| at(x).entropy(&mut scratch.clone()), &parameters));
+        scratch.fill(0.0);
+    }
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig::with_cases(40))]
+
+    /// Z, M, m, S and the density of the bump against quadrature of their definitions.
+    #[test]
+    fn the_bump_equals_quadrature(
+        parameters in prop::array::uniform5(-6.0f64..6.0),
+        eta in prop_oneof![
+            (1e-9f64..1e-3).prop_map(|x| 1.0 + x), 1.0f64..200.0, Just(1e12),
+        ],
+    ) {
+        let perturbation = FAMILY.perturbation(&parameters, &GaussianLaw, budget(eta));
+        let (c, k) = (perturbation.center(), perturbation.curvature());
+        let kernel = |xi: Vector2<f64>| {
+            (GaussianLaw.log_density(xi) - 0.5 * (xi - c).dot(&(k * (xi - c)))).exp()
+        };
+        let z = integrate(kernel, Vector2::zeros(), 10.0, 800);
+        assert_relative_eq!(perturbation.log_supremum(), -z.ln(), epsilon = 1e-7);
+
+        let mean = |i: usize| integrate(|xi| xi[i] * kernel(xi), Vector2::zeros(), 10.0, 800) / z;
+        let m = Vector2::new(mean(0), mean(1));
+        assert_relative_eq!(perturbation.mean(), m, epsilon = 1e-7);
+        let second = |i: usize, j: usize| {
+            let f = |xi: Vector2<f64>| (xi[i] - m[i]) * (xi[j] - m[j]) * kernel(xi);
+            integrate(f, Vector2::zeros(), 10.0, 800) / z
+        };
+        let s = Matrix2::new(second(0, 0), second(0, 1), second(0, 1), second(1, 1));
+        assert_relative_eq!(perturbation.covariance(), s, epsilon = 1e-7);
+
+        let density = |xi: Vector2<f64>| {
+            GaussianLaw.log_density(xi).exp() * perturbation.likelihood_ratio(xi)
+        };
+        let total = integrate(density, Vector2::zeros(), 10.0, 800);
+        prop_assert!((total - 1.0).abs() < 1e-6, "E[delta] = {total}");
+        // The supremum is attained at c and nowhere exceeded around it.
+        let top = perturbation.likelihood_ratio(c);
+        assert_relative_eq!(top, perturbation.supremum(), max_relative = 1e-9);
+        assert_relative_eq!(
+            top, perturbation.log_supremum().exp().min(eta), max_relative = 1e-9
+        );
+        for step in 0..8 {
+            let angle = f64::from(step) * std::f64::consts::FRAC_PI_4;
+            let near = c + Vector2::new(angle.cos(), angle.sin()) * 0.1;
+            prop_assert!(perturbation.likelihood_ratio(near) <= top);
+        }
+    }
+}
+
+/// Draws follow the density: first and second moments of the mixture.
+#[test]
+fn draws_of_the_bump_follow_its_mixture() {
+    let perturbation = FAMILY.perturbation(&[0.8, -0.5, 0.1, 0.2, 0.3], &GaussianLaw, budget(6.0));
+    let mut random = ChaCha8Rng::seed_from_u64(7);
+    let n = 400_000;
+    let draws: Vec<_> = (0..n).map(|_| perturbation.sample(&mut random)).collect();
+    let (weight, m) = (perturbation.weight(), perturbation.mean());
+    assert!(weight > 0.05 && weight < 1.0, "the budget should bind: {weight}");
+    let mean = draws.iter().sum::<Vector2<f64>>() / f64::from(n);
+    assert!((mean - m * weight).norm() < 0.01, "{mean} against {}", m * weight);
+    let second: Matrix2<f64> =
+        draws.iter().map(|d| d * d.transpose()).sum::<Matrix2<f64>>() / f64::from(n);
+    let expected = Matrix2::identity() * (1.0 - weight)
+        + (perturbation.covariance() + m * m.transpose()) * weight;
+    assert!((second - expected).norm() < 0.02, "{second} against {expected}");
+    // Importance weights undo the perturbation: E_Q[1/delta] = 1.
+    let back: f64 = draws.iter().map(|&d| 1.0 / perturbation.likelihood_ratio(d)).sum();
+    assert!((back / f64::from(n) - 1.0).abs() < 0.01);
+}
+
+#[test]
+fn budgets_refuse_what_is_none() {
+    for eta in [0.99, 0.0, -3.0, f64::NAN, f64::INFINITY] {
+        let message = Eta::new(eta).unwrap_err().to_string();
+        assert!(message.contains("at least 1"), "{message}");
+    }
+    assert_eq!(Eta::new(25.0).unwrap().to_string(), "25");
+    assert_eq!("2.5".parse::<Eta>().unwrap().alpha(), 0.4);
+}
+
+#[test]
+#[should_panic(expected = "not admissible")]
+fn an_inadmissible_ratio_is_caught() {
+    let _ = budget(2.0).spend(2.1);
+}
+
+#[test]
+fn a_small_ratio_raises_the_budget() {
+    assert_eq!(budget(4.0).spend(0.5).get(), 8.0);
+    assert_eq!(budget(4.0).spend(4.0).get(), 1.0);
+}

@@ -1,0 +1,145 @@
+//! Whole runs through the program: the same bits from the same seed, and evaluations that agree with
+//! exact laws.
+#![cfg(feature = "torch")]
+
+use assert_cmd::Command;
+use cvar_game::experiment::artefacts::{Chance, Evaluation, Mode};
+use cvar_game::game::returns::ReturnLaw;
+use serde_json::Value;
+use std::fs;
+use std::path::Path;
+
+fn program() -> Command {
+    Command::cargo_bin("cvar-game").unwrap()
+}
+
+fn bench(config: &Path, out: &Path, jobs: &str) {
+    program()
+        .args(["bench", "--jobs", jobs, "--config"])
+        .arg(config)
+        .arg("--out")
+        .arg(out)
+        .assert()
+        .success();
+}
+
+const SMALL: &str = r#"
+[experiment]
+etas = [1, 25]
+seeds = [1, 2]
+[train]
+steps = 30_000
+[evaluation]
+episodes = 500
+"#;
+
+const RUNS: [&str; 8] = [
+    "lava-grid/eta-1/seed-1",
+    "lava-grid/eta-1/seed-2",
+    "lava-grid/eta-25/seed-1",
+    "lava-grid/eta-25/seed-2",
+    "lava-point/eta-1/seed-1",
+    "lava-point/eta-1/seed-2",
+    "lava-point/eta-25/seed-1",
+    "lava-point/eta-25/seed-2",
+];
+
+fn without_timing(text: &str) -> Vec<Vec<&str>> {
+    let columns = |line: &'_ str| line.split(',').count() - 2;
+    text.lines().map(|line| line.split(',').take(columns(line)).collect()).collect()
+}
+
+fn read(path: &Path) -> String {
+    fs::read_to_string(path).unwrap()
+}
+
+fn evaluation(path: &Path) -> Evaluation {
+    let evaluation: Evaluation = serde_json::from_str(&read(path)).unwrap();
+    Evaluation { seconds: 0.0, ..evaluation }
+}
+
+#[test]
+fn one_seed_gives_the_same_bits_whatever_the_jobs() {
+    let folder = tempfile::tempdir().unwrap();
+    let config = folder.path().join("small.toml");
+    fs::write(&config, SMALL).unwrap();
+    let (one, two) = (folder.path().join("one"), folder.path().join("two"));
+    bench(&config, &one, "1");
+    bench(&config, &two, "2");
+    for run in RUNS {
+        let [a, b] = [one.join(run), two.join(run)];
+        let weights = [&a, &b].map(|run| fs::read(run.join("final.safetensors")).unwrap());
+        assert!(weights[0] == weights[1], "weights of {run}");
+        let progress = [&a, &b].map(|run| read(&run.join("progress.csv")));
+        assert_eq!(without_timing(&progress[0]), without_timing(&progress[1]), "progress of {run}");
+        let found = [&a, &b].map(|run| evaluation(&run.join("evaluation.json")));
+        assert_eq!(found[0], found[1], "evaluation of {run}");
+    }
+    // Finished runs are skipped; nothing is trained again.
+    let before =
+        fs::metadata(one.join(RUNS[0]).join("final.safetensors")).unwrap().modified().unwrap();
+    bench(&config, &one, "2");
+    let after =
+        fs::metadata(one.join(RUNS[0]).join("final.safetensors")).unwrap().modified().unwrap();
+    assert_eq!(before, after);
+}
+
+/// Trains a little and compares the exact laws with `episodes` played ones, and the exact worst-case
+/// antagonist with the CVaR.
+fn exact_laws_agree_with(episodes: u64) {
+    let folder = tempfile::tempdir().unwrap();
+    program()
+        .args(["train", "--env", "lava-grid", "--eta", "25", "--seed", "1", "--steps", "300000"])
+        .args(["--set", "evaluation.episodes=500", "--out"])
+        .arg(folder.path())
+        .assert()
+        .success();
+    let run = folder.path().join("lava-grid/eta-25/seed-1");
+    let exact = evaluation(&run.join("evaluation.json"));
+    let play = |antagonist: &str| -> Value {
+        let output = program()
+            .arg("evaluate")
+            .arg(&run)
+            .args(["--antagonist", antagonist, "--json", "--episodes", &episodes.to_string()])
+            .output()
+            .unwrap();
+        assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+        serde_json::from_slice(&output.stdout).unwrap()
+    };
+    let nominal = play("nominal");
+    for (mode, name) in [(Mode::Greedy, "greedy"), (Mode::Sampled, "sampled")] {
+        let law = &exact.play(mode, Chance::Nominal).unwrap().law;
+        assert_eq!(law.episodes(), None, "the stored law is exact");
+        let played = nominal["plays"]
+            .as_array()
+            .unwrap()
+            .iter()
+            .find(|play| play["protagonist"] == name)
+            .unwrap();
+        let law_played: ReturnLaw = serde_json::from_value(played["law"].clone()).unwrap();
+        assert_eq!(law_played.episodes(), Some(episodes));
+        let error = law_played.mean_standard_error();
+        assert!((law_played.mean() - law.mean()).abs() < 4.0 * error, "mean of the {name} policy");
+        for alpha in [0.5, 0.1, 0.04] {
+            let error = law_played.cvar_standard_error(alpha) + 1e-12;
+            let off = (law_played.cvar(alpha) - law.cvar(alpha)).abs();
+            assert!(off < 4.0 * error, "CVaR_{alpha} of the {name} policy: {off}, error {error}");
+        }
+    }
+    let cvar = exact.play(Mode::Greedy, Chance::Nominal).unwrap().law.cvar(0.04);
+    let worst = play("exact");
+    let law: ReturnLaw = serde_json::from_value(worst["plays"][0]["law"].clone()).unwrap();
+    let error = law.mean_standard_error() + 1e-9;
+    assert!((law.mean() - cvar).abs() < 4.0 * error, "{} against CVaR {cvar}", law.mean());
+}
+
+#[test]
+fn exact_laws_agree_with_played_episodes() {
+    exact_laws_agree_with(50_000);
+}
+
+#[test]
+#[ignore = "a million episodes take minutes without optimisation"]
+fn exact_laws_agree_with_a_million_episodes() {
+    exact_laws_agree_with(1_000_000);
+}
