@@ -1,6 +1,6 @@
 //! The exact worst-case antagonist of a deterministic policy.
 //!
-//! The infimum of E_Q[J] over the laws Q of trajectories with dQ/dP <= eta is CVaR_{1/eta}(J), and it
+//! The infimum of `E_Q[J]` over the laws Q of trajectories with dQ/dP <= eta is CVaR_{1/eta}(J), and it
 //! is attained by conditioning on the tail: with w = VaR_alpha(J), alpha = 1/eta, and the atom at w
 //! split so that the tail has probability alpha,
 //!
@@ -8,7 +8,7 @@
 //!   h at the end of an episode: 1 if J < w, (alpha - P(J < w)) / P(J = w) if J = w, 0 if J > w,
 //!   delta_t(o) = h(s', t + 1) / h(s, t).
 //!
-//! h is a martingale under P, so E_P[delta_t] = 1. The product of the perturbations of a trajectory
+//! h is a martingale under P, so `E_P[delta_t]` = 1. The product of the perturbations of a trajectory
 //! telescopes to h(end)/h(start) <= 1/alpha = eta, which is the budget of the paper (Eq. 5), and the
 //! remaining budget is eta_t = 1/h(s_t, t) >= sup_o delta_t(o). Its value is CVaR_{1/eta}(J).
 //!
@@ -92,7 +92,7 @@ impl<'a> WorstCase<'a> {
     /// delta_t(o) at a node, given the action the policy chooses there.
     ///
     /// Where h = 0 the tail is out of reach and delta = 1: under this antagonist such nodes have
-    /// probability 0. `action` must be the one of the policy, else E_P[delta] = 1 does not hold.
+    /// probability 0. `action` must be the one of the policy, else `E_P[delta]` = 1 does not hold.
     pub fn delta(&self, node: Node, action: usize, outcome: usize) -> f64 {
         let tail = self.tail_probability(node);
         if tail == 0.0 {

@@ -23,7 +23,7 @@ use serde::Serialize;
 /// The exact risk of one policy.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Risk {
-    /// E[J].
+    /// `E[J]`.
     pub mean: f64,
     /// CVaR_alpha(J).
     pub cvar: f64,

@@ -5,7 +5,7 @@
 //! rewards:
 //!
 //!   V_t(s, y) = max_a min_xi sum_o P(o) xi(o) [r + gamma V_{t+1}(s', y xi(o))],
-//!   0 <= xi <= 1/y, E_P[xi] = 1.
+//!   0 <= xi <= 1/y, `E_P[xi]` = 1.
 //!
 //! It lets the protagonist see y, which is the antagonist's choice and not information the
 //! protagonist has, so its value is at least max_pi CVaR_alpha and in general above it.
@@ -14,14 +14,14 @@
 //! They interpolate y V(s, y) between risk levels. Here it is exact. Let J be the whole return and
 //! W(y) = y V(y). With z(o) = y xi(o),
 //!
-//!   W_t(y) = max_a min { sum_o P(o) W_{t+1}(s', z(o)) : 0 <= z <= 1, E_P[z] = y },
+//!   W_t(y) = max_a min { sum_o P(o) W_{t+1}(s', z(o)) : 0 <= z <= 1, `E_P[z]` = y },
 //!
 //! and W = J z where the episode ends. By induction W is convex, piecewise linear on [0, 1] with
 //! W(0) = 0, and its slopes are attainable returns: the minimum takes the segments of the W_{t+1} in
 //! order of slope, and the maximum over actions of piecewise linear functions has no other slopes. So
 //! W is the integral of the quantile function of a law over the attainable returns; it is stored as
 //! the masses of that law, by return. The minimum is the P-mixture of the laws, the maximum is
-//! [`upper_envelope`]. One pass answers for every alpha.
+//! `upper_envelope`. One pass answers for every alpha.
 
 use super::mdp::FiniteMdp;
 use super::{ExactError, require_alpha};

@@ -224,11 +224,11 @@ pub struct Summary {
     pub optimal_cvar: f64,
     /// VaR_alpha(J) of the optimal policy.
     pub var: f64,
-    /// The best attainable E[J].
+    /// The best attainable `E[J]`.
     pub risk_neutral_mean: f64,
     /// CVaR_alpha(J) of the policy that attains it.
     pub risk_neutral_cvar: f64,
-    /// E[J] of the optimal policy.
+    /// `E[J]` of the optimal policy.
     pub optimal_policy_mean: f64,
     /// Probability that the optimal policy ends in lava.
     pub lava_probability: f64,

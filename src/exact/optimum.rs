@@ -2,7 +2,7 @@
 //!
 //! With alpha in (0, 1] (Rockafellar & Uryasev 2000; Baeuerle & Ott 2011),
 //!
-//!   max_pi CVaR_alpha(J) = max_w F(w),  F(w) = w - G(w)/alpha,  G(w) = min_pi E[(w - J)^+].
+//!   max_pi CVaR_alpha(J) = max_w F(w),  F(w) = w - G(w)/alpha,  G(w) = `min_pi E[(w - J)^+]`.
 //!
 //! G(w) is a finite-horizon dynamic programme over the nodes (t, R_t, s), whose accumulated reward
 //! R_t the utility (w - J)^+ needs. For a fixed policy `w - E[(w - J)^+]/alpha` is concave and
@@ -164,7 +164,7 @@ impl<'a> Shortfall<'a> {
         }
     }
 
-    /// G(w) = min_pi E[(w - J)^+].
+    /// G(w) = `min_pi E[(w - J)^+]`.
     fn least(&mut self, w: f64) -> f64 {
         let mdp = self.mdp;
         let states = mdp.states();
@@ -219,7 +219,7 @@ pub(super) fn expectation(mdp: &FiniteMdp, pair: usize, landed: &[f64]) -> f64 {
         .sum()
 }
 
-/// The policy that minimises E[(w - J)^+] and, among those that do, maximises E[J].
+/// The policy that minimises `E[(w - J)^+]` and, among those that do, maximises `E[J]`.
 pub(super) fn best_policy(mdp: &FiniteMdp, w: f64) -> Policy {
     let states = mdp.states();
     let excess: Vec<f64> = mdp.returns().iter().map(|value| (w - value).max(0.0)).collect();

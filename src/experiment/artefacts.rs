@@ -111,7 +111,7 @@ pub struct Audit {
     pub trajectories: u64,
     /// max prod delta / eta over all trajectories; at most 1.
     pub max_budget_use: f64,
-    /// max |E_P[delta_t] - 1| over all steps looked at.
+    /// max |`E_P[delta_t]` - 1| over all steps looked at.
     pub max_normalisation_error: f64,
     /// Steps or trajectories beyond tolerance.
     pub violations: u64,

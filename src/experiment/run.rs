@@ -49,7 +49,7 @@ pub enum RunError {
     Budget {
         /// max prod delta / eta.
         use_of_budget: f64,
-        /// max |E[delta] - 1|.
+        /// max |`E[delta]` - 1|.
         normalisation_error: f64,
     },
 }

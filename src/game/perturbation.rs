@@ -1,6 +1,6 @@
 //! Perturbations of chance: what an antagonist may do in one step.
 //!
-//! A perturbation is a likelihood ratio delta_t > 0 with E_P[delta_t] = 1 and
+//! A perturbation is a likelihood ratio delta_t > 0 with `E_P[delta_t]` = 1 and
 //! sup delta_t <= eta_t; chance then follows P_t(o) delta_t(o). A [`Family`] turns a few real
 //! parameters, the outputs of a network, into a perturbation that is admissible by construction,
 //! and knows the gradients that learning needs. All of it in f64: forty factors must multiply to
@@ -51,6 +51,6 @@ pub trait Perturbation {
     /// gradient by the family's parameters.
     fn entropy(&self, gradient: &mut [f64]) -> f64;
 
-    /// |E_P[delta_t] - 1|, by the closed form of the family, for the budget audit.
+    /// |`E_P[delta_t]` - 1|, by the closed form of the family, for the budget audit.
     fn normalisation_error(&self) -> f64;
 }

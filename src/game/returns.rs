@@ -62,7 +62,7 @@ impl ReturnLaw {
         self.episodes
     }
 
-    /// E[J].
+    /// `E[J]`.
     pub fn mean(&self) -> f64 {
         self.atoms.iter().map(|atom| atom.mass * atom.value).sum()
     }
@@ -89,7 +89,7 @@ impl ReturnLaw {
         self.atoms.last().map_or(f64::NAN, |atom| atom.value)
     }
 
-    /// CVaR_alpha(J) = w - E[(w - J)^+] / alpha at w = VaR_alpha(J).
+    /// CVaR_alpha(J) = w - `E[(w - J)^+]` / alpha at w = VaR_alpha(J).
     ///
     /// # Panics
     /// If `alpha` is outside (0, 1].
@@ -98,7 +98,7 @@ impl ReturnLaw {
         w - self.shortfall(w) / alpha
     }
 
-    /// E[(w - J)^+].
+    /// `E[(w - J)^+]`.
     pub fn shortfall(&self, w: f64) -> f64 {
         self.atoms.iter().map(|atom| atom.mass * (w - atom.value).max(0.0)).sum()
     }

@@ -86,7 +86,7 @@ pub struct Contest<W: Arena> {
     pub ratios: Vec<f64>,
     /// Rewards and ends.
     pub steps: Vec<Step>,
-    /// max |E_P[delta_t] - 1| of all steps so far; looked at if `audit` is set.
+    /// max |`E_P[delta_t]` - 1| of all steps so far; looked at if `audit` is set.
     pub normalisation_error: f64,
     /// Whether to look at the normalisation, which training has no time for.
     pub audit: bool,

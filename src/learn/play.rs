@@ -57,7 +57,7 @@ impl Episode {
 pub struct Played {
     /// All episodes, by index.
     pub episodes: Vec<Episode>,
-    /// max |E_P[delta_t] - 1| over all steps.
+    /// max |`E_P[delta_t]` - 1| over all steps.
     pub normalisation_error: f64,
 }
 

@@ -20,7 +20,7 @@ const REPLICATES: usize = 2000;
 pub struct Measures {
     /// Set of a failed run without evaluation: all else is `None`.
     pub absent: bool,
-    /// E[J] of the greedy protagonist under nominal chance.
+    /// `E[J]` of the greedy protagonist under nominal chance.
     pub mean: Option<f64>,
     /// Its CVaR at every alpha of [`Group::alphas`].
     pub cvar: Vec<Option<f64>>,
@@ -34,15 +34,15 @@ pub struct Measures {
     pub steps_to_goal: Option<f64>,
     /// Its mean least distance to lava.
     pub clearance: Option<f64>,
-    /// E[J] of the sampled protagonist under nominal chance.
+    /// `E[J]` of the sampled protagonist under nominal chance.
     pub sampled_mean: Option<f64>,
     /// CVaR_{1/eta} of the sampled protagonist under nominal chance.
     pub sampled_cvar: Option<f64>,
-    /// E[J] of the sampled protagonist under its antagonist.
+    /// `E[J]` of the sampled protagonist under its antagonist.
     pub game_value: Option<f64>,
     /// `game_value - sampled_cvar`.
     pub bound_slack: Option<f64>,
-    /// E[J] of the greedy protagonist under its antagonist.
+    /// `E[J]` of the greedy protagonist under its antagonist.
     pub greedy_game_value: Option<f64>,
     /// V*(eta) - CVaR_{1/eta}.
     pub regret: Option<f64>,
