@@ -9,8 +9,9 @@ mod progress;
 use anyhow::{Context, Result, bail};
 use clap::{Args, Parser, Subcommand, ValueEnum};
 use cvar_game::experiment::config::{
-    Config, ConfigError, Device, RunConfig, Setting, WorldConfig, WorldName, default_constants,
+    Config, ConfigError, Device, RunConfig, Setting, WorldConfig, default_constants,
 };
+use cvar_game::experiment::names::WorldName;
 use cvar_game::experiment::plan;
 use cvar_game::experiment::runner::{self, Launcher, Outcome, Prepared, Stop, Workers};
 #[cfg(feature = "torch")]

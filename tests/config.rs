@@ -1,7 +1,8 @@
 //! The configuration: layers, refusals, and the way into a run's folder and back.
 
-use cvar_game::experiment::config::{Config, DEFAULT, Device, RunConfig, Setting, WorldName};
-use cvar_game::experiment::plan::{self, RunId};
+use cvar_game::experiment::config::{Config, DEFAULT, Device, RunConfig, Setting};
+use cvar_game::experiment::names::{RunId, WorldName};
+use cvar_game::experiment::plan;
 use std::path::{Path, PathBuf};
 
 fn resolve(file: Option<&str>, sets: &[&str]) -> Result<Config, String> {

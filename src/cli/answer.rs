@@ -3,7 +3,7 @@
 use anyhow::{Context, Result};
 use cvar_game::experiment::artefacts::{Chance, Evaluation, Mode};
 #[cfg(feature = "torch")]
-use cvar_game::experiment::{artefacts::Play, plan::RunId};
+use cvar_game::experiment::{artefacts::Play, names::RunId};
 use cvar_game::game::budget::Eta;
 #[cfg(feature = "torch")]
 use cvar_game::game::returns::ReturnLaw;

@@ -1,7 +1,7 @@
 //! Progress of a sweep on standard error: bars on a terminal, plain lines otherwise.
 
 use super::answer::Greedy;
-use cvar_game::experiment::plan::RunId;
+use cvar_game::experiment::names::RunId;
 use cvar_game::experiment::runner::Event;
 use indicatif::{MultiProgress, ProgressBar, ProgressStyle};
 use std::io::{IsTerminal, stderr};

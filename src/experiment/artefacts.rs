@@ -10,7 +10,7 @@
 //! | `final.safetensors` | weights of both players at the end, never the best |
 //! | `evaluation.json` | [`Evaluation`]; written last, so that a run with it is finished |
 
-use super::config::RunConfig;
+use super::names::RunId;
 use crate::game::returns::ReturnLaw;
 use serde::{Deserialize, Serialize};
 use std::io::{self, Write};
@@ -46,14 +46,14 @@ pub struct Manifest {
 
 impl Manifest {
     /// The manifest of a run of this program on this machine.
-    pub fn of(run: &RunConfig, steps: u64, seconds: f64) -> Self {
+    pub fn of(run: RunId, device: &str, steps: u64, seconds: f64) -> Self {
         Manifest {
             schema: SCHEMA,
-            run: run.id().to_string(),
+            run: run.to_string(),
             version: env!("CARGO_PKG_VERSION").to_owned(),
             commit: option_env!("CVAR_GAME_COMMIT").map(str::to_owned),
             libtorch: "2.13.0".to_owned(),
-            device: run.device.to_string(),
+            device: device.to_owned(),
             cpu: processor(),
             seconds,
             steps,

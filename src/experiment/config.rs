@@ -17,7 +17,7 @@ mod layers;
 mod rules;
 
 use super::artefacts::SCHEMA;
-use super::plan::RunId;
+use super::names::{RunId, WorldName};
 use crate::game::budget::Eta;
 use crate::learn::options::{Credit, TrainOptions};
 use lava_envs::{grid::GridConfig, point::PointConfig};
@@ -113,45 +113,6 @@ pub enum ConfigError {
         /// The version it has.
         found: String,
     },
-}
-
-/// A world by its name in configurations, folders and tables.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
-#[serde(rename_all = "kebab-case")]
-pub enum WorldName {
-    /// The grid with slips.
-    LavaGrid,
-    /// The point mass with Gaussian noise.
-    LavaPoint,
-}
-
-impl WorldName {
-    /// All worlds, in the order of tables.
-    pub const ALL: [WorldName; 2] = [WorldName::LavaGrid, WorldName::LavaPoint];
-
-    /// The name as text.
-    pub const fn as_str(self) -> &'static str {
-        match self {
-            WorldName::LavaGrid => "lava-grid",
-            WorldName::LavaPoint => "lava-point",
-        }
-    }
-}
-
-impl fmt::Display for WorldName {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.pad(self.as_str())
-    }
-}
-
-impl FromStr for WorldName {
-    type Err = String;
-
-    fn from_str(name: &str) -> Result<Self, String> {
-        WorldName::ALL.into_iter().find(|world| world.as_str() == name).ok_or_else(|| {
-            format!("there is no world {name:?}; the worlds are {}", rules::WORLDS.join(" and "))
-        })
-    }
 }
 
 /// The device that the networks are on.

@@ -6,8 +6,8 @@
 //! value under the learned antagonist, the CVaR of the sampled policy, the CVaR of the greedy policy.
 
 use super::artefacts::{Audit, Certificate, Chance, Mode, Play};
-use super::config::{RunConfig, WorldConfig};
-use super::run::{RunError, load};
+use super::config::{Device, RunConfig, WorldConfig};
+use super::failure::RunError;
 use crate::exact::antagonist::WorstCase;
 use crate::exact::grid::ExactGrid;
 use crate::exact::policy::Policy;
@@ -16,6 +16,7 @@ use crate::learn::contest::{self, Choosing, Opponent};
 use crate::learn::head::CategoricalPolicy;
 use crate::learn::pair::Pair;
 use crate::learn::play::{self, Played};
+use crate::learn::weights;
 use lava_envs::law::{FiniteLaw, MOVES, sample_index};
 use lava_envs::random::ChaCha8Rng;
 use lava_envs::{ConfigError, GridConfig, LavaGrid, LavaPoint, PointConfig, World};
@@ -229,6 +230,24 @@ fn answer<W: Yardstick>(
             Ok(to_play(mode, chance, &play_episodes(run, constants, &pair, mode, kind)?))
         })
         .collect()
+}
+
+/// The trained pair of a finished run.
+fn load<W: Arena>(run: &RunConfig, folder: &Path) -> Result<Pair<W>, RunError> {
+    let path = folder.join("final.safetensors");
+    let bytes = std::fs::read(&path).map_err(RunError::file(&path))?;
+    let device = device(run.device);
+    let mut pair = Pair::<W>::new(&run.train, run.eta, run.seed, device);
+    weights::load(&mut pair, &bytes, device)?;
+    Ok(pair)
+}
+
+/// The device of the networks, as libtorch names it.
+pub fn device(device: Device) -> tch::Device {
+    match device {
+        Device::Cpu => tch::Device::Cpu,
+        Device::Cuda(number) => tch::Device::Cuda(number),
+    }
 }
 
 impl Yardstick for LavaGrid {

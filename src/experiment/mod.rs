@@ -3,6 +3,7 @@
 //! | question | module |
 //! |---|---|
 //! | which options are there, and what may they be | [`config`] |
+//! | what are worlds and runs called | [`names`] |
 //! | which runs does a configuration mean | [`plan`] |
 //! | how are they carried out, many at a time | [`runner`] |
 //! | what does a run leave behind | [`artefacts`] |
@@ -11,6 +12,9 @@ pub mod artefacts;
 pub mod config;
 #[cfg(feature = "torch")]
 pub mod evaluation;
+#[cfg(feature = "torch")]
+pub mod failure;
+pub mod names;
 pub mod plan;
 #[cfg(feature = "torch")]
 pub mod run;

@@ -1,65 +1,17 @@
 //! One run, from its configuration to its artefacts: train, keep the weights, evaluate.
 
 use super::artefacts::{Evaluation, Manifest, SCHEMA, write_in_place};
-use super::config::{Device, RunConfig, WorldConfig};
+use super::config::{RunConfig, WorldConfig};
 use super::evaluation::{self, Yardstick};
+use super::failure::RunError;
 use super::runner::Tick;
-use crate::exact::ExactError;
-use crate::learn::arena::Arena;
-use crate::learn::pair::Pair;
-use crate::learn::train::{Game, Progress, TrainError, train};
-use crate::learn::weights::{self, WeightsError};
+use crate::learn::train::{Game, Progress, train};
+use crate::learn::weights;
 use lava_envs::{LavaGrid, LavaPoint};
 use std::fs::File;
 use std::io::{self, BufWriter, Write};
 use std::path::Path;
 use std::time::Instant;
-
-/// Why a run failed.
-#[derive(Debug, thiserror::Error)]
-pub enum RunError {
-    /// Training stopped.
-    #[error(transparent)]
-    Train(#[from] TrainError),
-    /// The world refuses its constants.
-    #[error(transparent)]
-    World(#[from] lava_envs::ConfigError),
-    /// A yardstick refuses the world.
-    #[error(transparent)]
-    Exact(#[from] ExactError),
-    /// The weights are not those of the run.
-    #[error("final.safetensors does not fit the run: {0}")]
-    Weights(#[from] WeightsError),
-    /// A file could not be read or written.
-    #[error("{path}: {source}")]
-    File {
-        /// The file.
-        path: String,
-        /// What the system says.
-        source: io::Error,
-    },
-    /// There is no such antagonist.
-    #[error("{0}")]
-    NoOpponent(&'static str),
-    /// The antagonist broke its budget: an error of this program.
-    #[error(
-        "the antagonist broke its budget: prod delta / eta reached {use_of_budget}, \
-         |E[delta] - 1| reached {normalisation_error}; please report this with the run's config.toml"
-    )]
-    Budget {
-        /// max prod delta / eta.
-        use_of_budget: f64,
-        /// max |`E[delta]` - 1|.
-        normalisation_error: f64,
-    },
-}
-
-impl RunError {
-    /// An error about a file of the run.
-    pub fn file(path: &Path) -> impl FnOnce(io::Error) -> RunError + '_ {
-        move |source| RunError::File { path: path.display().to_string(), source }
-    }
-}
 
 /// Carries out the run and leaves its artefacts in `folder`, `evaluation.json` last.
 ///
@@ -90,7 +42,7 @@ fn carry_out<W: Yardstick>(
         eta: run.eta,
         gamma: run.gamma,
         seed: run.seed,
-        device: device(run.device),
+        device: evaluation::device(run.device),
         options: &run.train,
     };
     let start = Instant::now();
@@ -106,7 +58,7 @@ fn carry_out<W: Yardstick>(
     let seconds = start.elapsed().as_secs_f64();
     written.and_then(|()| progress.finish()).map_err(RunError::file(&path))?;
 
-    let mut manifest = Manifest::of(run, last.steps, seconds);
+    let mut manifest = Manifest::of(run.id(), &run.device.to_string(), last.steps, seconds);
     manifest.failure = trained.as_ref().err().map(ToString::to_string);
     write_json(&folder.join("manifest.json"), &manifest)?;
     let pair = trained?;
@@ -128,26 +80,6 @@ fn carry_out<W: Yardstick>(
         certificate: found.certificate,
     };
     write_json(&folder.join("evaluation.json"), &evaluation)
-}
-
-/// The trained pair of a finished run.
-///
-/// # Errors
-/// If the weights cannot be read or are not of this run.
-pub fn load<W: Arena>(run: &RunConfig, folder: &Path) -> Result<Pair<W>, RunError> {
-    let path = folder.join("final.safetensors");
-    let bytes = std::fs::read(&path).map_err(RunError::file(&path))?;
-    let device = device(run.device);
-    let mut pair = Pair::<W>::new(&run.train, run.eta, run.seed, device);
-    weights::load(&mut pair, &bytes, device)?;
-    Ok(pair)
-}
-
-fn device(device: Device) -> tch::Device {
-    match device {
-        Device::Cpu => tch::Device::Cpu,
-        Device::Cuda(number) => tch::Device::Cuda(number),
-    }
 }
 
 fn write_json(path: &Path, value: &impl serde::Serialize) -> Result<(), RunError> {

@@ -10,7 +10,8 @@ mod worker;
 
 use super::artefacts::{Evaluation, Manifest, SCHEMA, write_in_place};
 use super::config::{Config, ConfigError, RunConfig};
-use super::plan::{self, RunId};
+use super::names::RunId;
+use super::plan;
 use serde::{Deserialize, Deserializer, Serialize};
 use std::fs::{self, File, TryLockError};
 use std::io;
@@ -409,7 +410,8 @@ fn record_failure(
 ) -> io::Result<()> {
     let path = folder.join("manifest.json");
     let written = fs::read(&path).ok().and_then(|bytes| serde_json::from_slice(&bytes).ok());
-    let mut manifest = written.unwrap_or_else(|| Manifest::of(run, steps, seconds));
+    let mut manifest =
+        written.unwrap_or_else(|| Manifest::of(run.id(), &run.device.to_string(), steps, seconds));
     manifest.failure.get_or_insert_with(|| reason.to_owned());
     let mut text = serde_json::to_string_pretty(&manifest)?;
     text.push('\n');

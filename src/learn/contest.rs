@@ -7,7 +7,7 @@
 use crate::game::budget::{Budget, Eta};
 use crate::game::perturbation::{Family, Perturbation};
 use crate::learn::arena::Arena;
-use crate::learn::head::{Head, MAX_PARAMETERS, Policy};
+use crate::learn::head::Policy;
 use crate::learn::pair::{Pair, Protagonist, Views};
 use lava_envs::random::ChaCha8Rng;
 use lava_envs::{Law, Step};
@@ -146,7 +146,7 @@ impl<W: Arena> Contest<W> {
         protagonist.network.act(&self.protagonist_inputs, &mut self.protagonist_outputs);
         self.actions.clear();
         for slot in 0..self.slots() {
-            let parameters = parameters_of(protagonist, &self.protagonist_outputs, slot);
+            let parameters = protagonist.parameters_in(&self.protagonist_outputs, slot);
             let head = &protagonist.head;
             self.actions.push(match choosing {
                 Choosing::Greedy => head.greedy(&parameters),
@@ -185,7 +185,7 @@ impl<W: Arena> Contest<W> {
             let (outcome, ratio) = match (chance, learned) {
                 (Chance::Opponent(opponent), _) => opponent.draw(&self.world, slot, &law, random),
                 (_, Some(antagonist)) => {
-                    let parameters = parameters_of(antagonist, &self.antagonist_outputs, slot);
+                    let parameters = antagonist.parameters_in(&self.antagonist_outputs, slot);
                     let perturbation = antagonist.head.0.perturbation(&parameters, &law, budget);
                     if self.audit {
                         let error = perturbation.normalisation_error();
@@ -207,20 +207,4 @@ impl<W: Arena> Contest<W> {
             }
         }
     }
-}
-
-/// Parameters of a player's head in a slot: the actor's outputs and the head's constants.
-pub fn parameters_of<H: Head>(
-    player: &crate::learn::ppo::Player<H>,
-    outputs: &[f32],
-    slot: usize,
-) -> [f64; MAX_PARAMETERS] {
-    let slots = outputs.len() / player.network.shape().outputs;
-    let mut parameters = [0.0; MAX_PARAMETERS];
-    let outputs = outputs.iter().skip(slot).step_by(slots);
-    let numbers = outputs.chain(player.network.constants());
-    for (parameter, &number) in parameters.iter_mut().zip(numbers) {
-        *parameter = f64::from(number);
-    }
-    parameters
 }

@@ -33,4 +33,6 @@ pub mod rollout;
 #[cfg(feature = "torch")]
 pub mod train;
 #[cfg(feature = "torch")]
+pub mod trajectories;
+#[cfg(feature = "torch")]
 pub mod weights;

@@ -57,13 +57,6 @@ impl<W: Arena> Pair<W> {
     }
 }
 
-impl<W: Arena> Pair<W> {
-    /// The antagonist's perturbation family.
-    pub fn family(&self) -> Option<&W::Family> {
-        self.antagonist.as_ref().map(|antagonist| &antagonist.head.0)
-    }
-}
-
 /// What the players see.
 ///
 /// The protagonist sees the world's observation, and the time if it is time-aware; never the budget:

@@ -15,7 +15,7 @@ use crate::learn::gae;
 use crate::learn::head::{Head, MAX_PARAMETERS};
 use crate::learn::network::{Network, Shape};
 use crate::learn::options::PlayerOptions;
-use crate::learn::rollout::Trajectories;
+use crate::learn::trajectories::Trajectories;
 use lava_envs::random::ChaCha8Rng;
 use rand::seq::SliceRandom;
 use tch::Device;
@@ -116,6 +116,18 @@ impl<H: Head> Player<H> {
         assert!(shape.outputs + shape.constants <= MAX_PARAMETERS, "parameters of the head");
         let optimiser = Adam::new(shape.parameters());
         Player { head, network, optimiser }
+    }
+
+    /// Parameters of the head in a slot: the actor's outputs there, of shape `[k, slots]`, and the
+    /// head's constants.
+    pub fn parameters_in(&self, outputs: &[f32], slot: usize) -> [f64; MAX_PARAMETERS] {
+        let slots = outputs.len() / self.network.shape().outputs;
+        let numbers = outputs.iter().skip(slot).step_by(slots).chain(self.network.constants());
+        let mut parameters = [0.0; MAX_PARAMETERS];
+        for (parameter, &number) in parameters.iter_mut().zip(numbers) {
+            *parameter = f64::from(number);
+        }
+        parameters
     }
 
     /// One update on the trajectories of a rollout: epochs of minibatches in random order.

@@ -1,57 +1,15 @@
 //! Rollouts: a fixed number of steps of parallel games, recorded for both players.
 
-use crate::game::budget::{Budget, Eta};
+use crate::game::budget::Eta;
 use crate::game::returns::Atom;
 use crate::learn::arena::Arena;
-use crate::learn::contest::{Chance, Choosing, Contest, Streams, parameters_of};
+use crate::learn::contest::{Chance, Choosing, Contest, Streams};
 use crate::learn::head::{AntagonistHead, Head};
 use crate::learn::options::Credit;
 use crate::learn::pair::Pair;
+use crate::learn::trajectories::Trajectories;
 use lava_envs::random::{Purpose, stream};
 use lava_envs::{End, Law};
-
-/// What one player saw, chose and earned. Time-major: index `t * slots + slot`.
-#[derive(Debug, Clone)]
-pub struct Trajectories<H: Head> {
-    /// Number of slots.
-    pub slots: usize,
-    /// Inputs, shape `[steps + 1, slots, inputs + 1]`; the last block is the state after the last
-    /// step, for bootstrapping.
-    pub inputs: Vec<f32>,
-    /// What the law depended on, `[steps, slots]`.
-    pub given: Vec<H::Given>,
-    /// Choices, `[steps, slots]`.
-    pub choices: Vec<H::Choice>,
-    /// log-probabilities of the choices, `[steps, slots]`.
-    pub log_probabilities: Vec<f64>,
-    /// The player's own rewards, `[steps, slots]`.
-    pub rewards: Vec<f32>,
-    /// Whether the episode ended with this step, `[steps, slots]`.
-    pub ended: Vec<bool>,
-}
-
-impl<H: Head> Trajectories<H> {
-    fn new(slots: usize) -> Self {
-        Trajectories {
-            slots,
-            inputs: Vec::new(),
-            given: Vec::new(),
-            choices: Vec::new(),
-            log_probabilities: Vec::new(),
-            rewards: Vec::new(),
-            ended: Vec::new(),
-        }
-    }
-
-    fn clear(&mut self) {
-        self.inputs.clear();
-        self.given.clear();
-        self.choices.clear();
-        self.log_probabilities.clear();
-        self.rewards.clear();
-        self.ended.clear();
-    }
-}
 
 /// Plays and records.
 pub struct Collector<W: Arena> {
@@ -161,7 +119,7 @@ impl<W: Arena> Collector<W> {
                 Credit::Executed => W::executed(contest.outcomes[slot]),
             }
             .unwrap_or(contest.actions[slot]);
-            let parameters = parameters_of(&pair.protagonist, &contest.protagonist_outputs, slot);
+            let parameters = pair.protagonist.parameters_in(&contest.protagonist_outputs, slot);
             let log_probability = pair.protagonist.head.log_probability(&parameters, &(), &choice);
             record.given.push(());
             record.choices.push(choice);
@@ -212,10 +170,5 @@ impl<W: Arena> Collector<W> {
     pub fn share(&self, end: End) -> f64 {
         let count = self.finished.iter().filter(|e| e.end == end).count();
         count as f64 / self.finished.len() as f64
-    }
-
-    /// Budgets that remain, for tests.
-    pub fn budgets(&self) -> &[Budget] {
-        &self.contest.budgets
     }
 }
