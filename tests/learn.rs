@@ -198,7 +198,7 @@ fn network_gradients_equal_autograd() {
     };
     let (h, k) = (shape.hidden, shape.outputs);
     let x = Tensor::from_slice(&inputs).view([n as i64, -1]).tr();
-    let hidden = piece(0, 2 * h, shape.width()).mm(&x).tanh();
+    let hidden = piece(0, shape.width(), 2 * h).tr().mm(&x).tanh();
     let second = piece(shape.second_at(0, 0), k + 1, 2 * h);
     let bias = piece(shape.bias_at(), k + 1, 1);
     let half = |rows: (usize, usize), units: (usize, usize)| {

@@ -15,11 +15,12 @@
 //! dL/dV = dL/dy h' (its diagonal blocks),   dL/dh = V' dL/dy,   dL/dW = (dL/dh * (1 - h^2)) x'.
 //! ```
 //!
-//! All parameters live in one flat vector `[W | V | b | c]`, where c are the constants of the
+//! All parameters live in one flat vector `[W' | V | b | c]`, where c are the constants of the
 //! actor's head that no observation moves (the log standard deviations of a Gaussian policy).
 //!
-//! Columns per sample rather than rows, because the matrix library is five times faster with
-//! `[5, 128] [128, n]` than with `[n, 128] [128, 5]`.
+//! Columns per sample rather than rows, and W transposed, because the matrix library is five times
+//! faster with `[5, 128] [128, n]` than with `[n, 128] [128, 5]`, and with `x (dL/dh)'` than with
+//! `dL/dh x'`.
 
 use nalgebra::DMatrix;
 use rand::{Rng, RngExt};
@@ -70,7 +71,7 @@ impl Shape {
 
     /// Index of W's entry for a hidden unit (the critic's behind the actor's) and an input.
     pub fn first_at(&self, unit: usize, input: usize) -> usize {
-        unit * self.width() + input
+        input * 2 * self.hidden + unit
     }
 
     /// Index of V's entry for a row of y and a hidden unit.
@@ -147,7 +148,7 @@ impl Network {
             let (first, second) = (shape.first() as i64, shape.second() as i64);
             let wide = 2 * shape.hidden as i64;
             (
-                tensor.narrow(0, 0, first).view([wide, shape.width() as i64]),
+                tensor.narrow(0, 0, first).view([shape.width() as i64, wide]).tr(),
                 tensor.narrow(0, first, second).view([shape.rows() as i64, wide]),
             )
         };
@@ -198,7 +199,7 @@ impl Network {
     /// shape `[n, inputs + 1]`.
     pub fn act(&self, inputs: &[f32], outputs: &mut Vec<f32>) {
         let (hidden, k) = (self.shape.hidden as i64, self.shape.outputs as i64);
-        let h = tanh_(self.first.narrow(0, 0, hidden).mm(&self.tensor(inputs).tr()));
+        let h = tanh_(self.first.narrow(0, 0, hidden).mm(&self.columns(inputs)));
         let y = self.second.narrow(0, 0, k).narrow(1, 0, hidden).mm(&h);
         download(&y, outputs);
         let bias = self.shape.bias_at();
@@ -208,7 +209,7 @@ impl Network {
     /// Values of the critic alone, shape `[n]`, for inputs as in [`Network::act`].
     pub fn values(&self, inputs: &[f32], values: &mut Vec<f32>) {
         let (hidden, k) = (self.shape.hidden as i64, self.shape.outputs as i64);
-        let h = tanh_(self.first.narrow(0, hidden, hidden).mm(&self.tensor(inputs).tr()));
+        let h = tanh_(self.first.narrow(0, hidden, hidden).mm(&self.columns(inputs)));
         download(&self.second.narrow(0, k, 1).narrow(1, hidden, hidden).mm(&h), values);
         let bias = self.shape.bias_at() + self.shape.outputs;
         add_bias(values, &self.parameters[bias..=bias]);
@@ -224,10 +225,10 @@ impl Network {
         loss: impl FnOnce(&mut [f32], &[f32], &mut [f32]) -> R,
     ) -> R {
         let shape = self.shape;
-        let x = self.tensor(inputs);
-        let samples = x.size()[0];
+        let x = self.columns(inputs).contiguous();
+        let samples = x.size()[1];
         let buffers = Buffers::of(&mut self.buffers, samples, shape, self.device);
-        let _ = self.first.mm_out(&buffers.hidden, &x.tr());
+        let _ = self.first.mm_out(&buffers.hidden, &x);
         let h = tanh_(buffers.hidden.shallow_clone());
         let _ = self.second.mm_out(&buffers.outputs, &h);
 
@@ -243,7 +244,7 @@ impl Network {
         let by_h = &buffers.hidden_gradient;
         let _ = self.second.tr().mm_out(by_h, &by_y);
         let _ = Tensor::tanh_backward_grad_input(by_h, by_h, &h);
-        let _ = by_h.mm_out(&self.first_gradient, &x);
+        let _ = x.mm_out(&self.first_gradient.tr(), &by_h.tr());
 
         download(&self.gradient, gradient);
         let hidden = shape.hidden;
@@ -259,8 +260,9 @@ impl Network {
         result
     }
 
-    fn tensor(&self, inputs: &[f32]) -> Tensor {
-        Tensor::from_slice(inputs).view([-1, self.shape.width() as i64]).to_device(self.device)
+    /// x, a column per sample.
+    fn columns(&self, inputs: &[f32]) -> Tensor {
+        Tensor::from_slice(inputs).view([-1, self.shape.width() as i64]).to_device(self.device).tr()
     }
 }
 

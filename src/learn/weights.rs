@@ -112,18 +112,20 @@ fn restore<H: Head>(
     Ok(())
 }
 
-/// Where a tensor's entries lie in the flat parameters: row i at `start + i * stride`.
+/// Where a tensor's entries lie in the flat parameters: entry (i, j) at
+/// `start + i * strides[0] + j * strides[1]`.
 struct Place {
     shape: Vec<usize>,
     start: usize,
-    stride: usize,
+    strides: [usize; 2],
 }
 
 impl Place {
     fn indices(&self) -> impl Iterator<Item = usize> + '_ {
         let columns = self.shape.get(1).copied().unwrap_or(1);
+        let [down, across] = self.strides;
         (0..self.shape[0])
-            .flat_map(move |i| (0..columns).map(move |j| self.start + i * self.stride + j))
+            .flat_map(move |i| (0..columns).map(move |j| self.start + i * down + j * across))
     }
 }
 
@@ -131,19 +133,21 @@ impl Place {
 fn layout(role: Role, shape: Shape) -> Vec<(String, Place)> {
     let Shape { inputs, hidden, outputs, constants } = shape;
     let mut places = Vec::new();
-    let mut add = |name: &str, shape: Vec<usize>, start, stride| {
-        places.push((format!("{role}.{name}"), Place { shape, start, stride }));
+    let mut add = |name: &str, shape: Vec<usize>, start, strides| {
+        places.push((format!("{role}.{name}"), Place { shape, start, strides }));
     };
+    let wide = 2 * hidden;
     for (net, unit, row, rows) in [("actor", 0, 0, outputs), ("critic", hidden, outputs, 1)] {
-        let width = shape.width();
-        add(&format!("{net}.hidden.weight"), vec![hidden, inputs], shape.first_at(unit, 0), width);
-        add(&format!("{net}.hidden.bias"), vec![hidden], shape.first_at(unit, inputs), width);
-        let (start, wide) = (shape.second_at(row, unit), 2 * hidden);
-        add(&format!("{net}.output.weight"), vec![rows, hidden], start, wide);
-        add(&format!("{net}.output.bias"), vec![rows], shape.bias_at() + row, 1);
+        let first = shape.first_at(unit, 0);
+        add(&format!("{net}.hidden.weight"), vec![hidden, inputs], first, [1, wide]);
+        let bias = shape.first_at(unit, inputs);
+        add(&format!("{net}.hidden.bias"), vec![hidden], bias, [1, 0]);
+        let second = shape.second_at(row, unit);
+        add(&format!("{net}.output.weight"), vec![rows, hidden], second, [wide, 1]);
+        add(&format!("{net}.output.bias"), vec![rows], shape.bias_at() + row, [1, 0]);
     }
     if constants > 0 {
-        add("actor.constants", vec![constants], shape.constants_at(), 1);
+        add("actor.constants", vec![constants], shape.constants_at(), [1, 0]);
     }
     places
 }
