@@ -1,4 +1,4 @@
-//! Chores of the workspace: `cargo xtask setup`, `test`, `bench`.
+//! Chores of the workspace: `cargo xtask setup`, `test`, `bench`, `speed`.
 //!
 //! Training needs libtorch, a C++ library of 480 MB that cargo cannot fetch. `setup` fetches it
 //! once for all checkouts of one user and links it into this one; after that plain `cargo build`,
@@ -7,12 +7,14 @@
 
 mod cache;
 mod libtorch;
+mod speed;
 mod tools;
 mod wheels;
 
 use std::ffi::OsString;
 use std::path::{Path, PathBuf};
 use std::process::{Command, ExitCode};
+use std::time::SystemTime;
 
 use anyhow::{Context, Result, bail};
 use clap::{Parser, Subcommand};
@@ -40,6 +42,12 @@ enum Verb {
     /// Set up, then run the quick benchmark (configs/quick.toml) with the release build
     Bench {
         /// Passed on to `cvar-game bench`
+        #[arg(trailing_var_arg = true, allow_hyphen_values = true)]
+        passed_on: Vec<OsString>,
+    },
+    /// Set up, then measure the speed of training and its parts; the table goes to target/speed.md
+    Speed {
+        /// Passed on to the benchmarks, such as a filter of their names: `rollout`
         #[arg(trailing_var_arg = true, allow_hyphen_values = true)]
         passed_on: Vec<OsString>,
     },
@@ -75,6 +83,18 @@ fn run(verb: Verb) -> Result<ExitCode> {
             ],
             &passed_on,
         ),
+        Verb::Speed { passed_on } => {
+            let target = speed::target(&repository);
+            let start = SystemTime::now();
+            let mut command = cargo_command(&repository);
+            command.args(speed::CARGO).arg("--").args(passed_on);
+            command.env("CRITERION_HOME", target.join("criterion"));
+            let code = finish(command)?;
+            if code == ExitCode::SUCCESS {
+                speed::report(&target, start)?;
+            }
+            Ok(code)
+        }
     }
 }
 
@@ -106,9 +126,16 @@ fn set_up(repository: &Path) -> Result<()> {
 
 /// Runs cargo in the repository and hands on its exit code.
 fn cargo(repository: &Path, arguments: &[&str], passed_on: &[OsString]) -> Result<ExitCode> {
+    let mut command = cargo_command(repository);
+    command.args(arguments).args(passed_on);
+    finish(command)
+}
+
+/// Cargo, to be run in the repository.
+fn cargo_command(repository: &Path) -> Command {
     let program = std::env::var_os("CARGO").unwrap_or_else(|| "cargo".into());
     let mut command = Command::new(program);
-    command.args(arguments).args(passed_on).current_dir(repository);
+    command.current_dir(repository);
     // `cargo run` gave this process variables of its own package. Left in place they would differ
     // from those of a plain build and could make cargo build things twice.
     for (name, _) in std::env::vars_os() {
@@ -117,6 +144,10 @@ fn cargo(repository: &Path, arguments: &[&str], passed_on: &[OsString]) -> Resul
             command.env_remove(&name);
         }
     }
+    command
+}
+
+fn finish(mut command: Command) -> Result<ExitCode> {
     let status = command.status().context("cargo could not be started")?;
     match status.code() {
         Some(code) => Ok(ExitCode::from(u8::try_from(code).unwrap_or(1))),
