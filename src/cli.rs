@@ -8,6 +8,7 @@ mod progress;
 
 use anyhow::{Context, Result, bail};
 use clap::{Args, Parser, Subcommand, ValueEnum};
+use cvar_game::exact::oracle;
 use cvar_game::experiment::config::{
     Config, ConfigError, Device, RunConfig, Setting, WorldConfig, default_constants,
 };
@@ -191,14 +192,19 @@ impl From<Antagonist> for Chance {
     }
 }
 
-/// Solve a world exactly: the best CVaR there is, and how to reach it.
+/// Solve a world: the best CVaR there is, and how to reach it.
+///
+/// lava-grid is solved exactly. On lava-point a near-optimal controller is computed on a lattice and
+/// played in the physical world, which takes minutes; what it attains there is a lower bound on the
+/// best CVaR. The certificate is kept in $XDG_CACHE_HOME/cvar-game/oracle, by default under ~/.cache.
 #[derive(Debug, Args)]
 #[command(after_help = "\
 Examples:
   cvar-game exact --env lava-grid --eta 25
-  cvar-game exact --env lava-grid --eta 100 --set env.slip=0.1 --json")]
+  cvar-game exact --env lava-grid --eta 100 --set env.slip=0.1 --json
+  cvar-game exact --env lava-point --eta 25")]
 struct ExactArgs {
-    /// World: lava-grid.
+    /// World: lava-grid or lava-point.
     #[arg(long)]
     env: WorldName,
     /// Budget, at least 1; the risk level is alpha = 1/eta.
@@ -450,11 +456,20 @@ fn read_run(folder: &Path) -> Result<RunConfig> {
 fn exact(args: &ExactArgs) -> Result<ExitCode> {
     let options = vec![select(args.env), budget(args.eta)?];
     let config = args.overrides.resolve(args.config.as_deref(), options)?;
-    let WorldConfig::LavaGrid(grid) = &config.world(args.env).constants else {
-        bail!("{} has no exact solution; use --env lava-grid", args.env);
-    };
-    let summary = exact::grid::solve(grid, config.gamma, config.experiment.etas[0].get())?;
-    answer::give(&summary, args.json)
+    let (gamma, eta) = (config.gamma, config.experiment.etas[0].get());
+    match &config.world(args.env).constants {
+        WorldConfig::LavaGrid(grid) => {
+            answer::give(&exact::grid::solve(grid, gamma, eta)?, args.json)
+        }
+        WorldConfig::LavaPoint(point) => {
+            let effort = oracle::Effort::default();
+            let certified = match oracle::cache_folder() {
+                Some(folder) => oracle::certify_cached(point, gamma, eta, &effort, &folder)?,
+                None => oracle::certify_with(point, gamma, eta, &effort)?,
+            };
+            answer::give(&certified, args.json)
+        }
+    }
 }
 
 fn table(args: &TableArgs) -> Result<ExitCode> {

@@ -104,10 +104,6 @@ fn bad_input_is_refused_in_one_line_that_says_what_to_do() {
         (vec!["bench", "--config", "no.toml"], ["cannot read no.toml", "give the path"]),
         (vec!["table", out], ["cannot read", "check the path"]),
         (vec!["evaluate", out], ["holds no run", "give the folder of one"]),
-        (
-            vec!["exact", "--env", "lava-point", "--eta", "2"],
-            ["lava-point has no exact solution", "use --env lava-grid"],
-        ),
         (vec!["exact", "--env", "lava-grid", "--eta", "0"], ["--eta", "at least 1, got 0"]),
     ] {
         let message = refusal(&arguments);

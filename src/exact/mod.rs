@@ -10,6 +10,7 @@
 //! | how good can a policy without a clock be | [`stationary`] |
 //! | how far is a trained policy from the optimum | [`certificate`] |
 //! | all of it on the grid | [`grid`] |
+//! | what can be attained certifiably on the point mass, where nothing is exact | [`oracle`] |
 //!
 //! Symbols: budget eta >= 1, risk level alpha = 1/eta, return J, threshold w, time t, state s, outcome
 //! of chance o, perturbation delta_t(o). Rewards and returns are in the world's reward units.
@@ -21,6 +22,7 @@ pub mod grid;
 pub mod law;
 pub mod mdp;
 pub mod optimum;
+pub mod oracle;
 pub mod policy;
 pub mod stationary;
 

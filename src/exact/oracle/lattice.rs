@@ -1,0 +1,416 @@
+//! The lattice over position and velocity, and one control step on it.
+//!
+//! Positions lie on a lattice over [r, W - r] x [r, H - r]. Velocities lie on three lattices of the
+//! same spacing dv, each symmetric about 0:
+//!
+//! | lattice | of | reaches |
+//! |---|---|---|
+//! | v | velocity before the push | A rho/(1-rho) + 2.5 rho sigma / sqrt(1-rho^2), the fastest steady drift and its spread |
+//! | vbar | mean velocity v + A u | that of v, and A |
+//! | v+ | velocity after the noise | that of vbar, and 4 sigma |
+//!
+//! # One step, given v+
+//! A substep of length h moves by h v and then leaves the share rho^(1/n) of v, so that a step of n
+//! substeps in free flight displaces by
+//!
+//!   v+ tau (1 - rho) / (n (1 - rho^(1/n))),
+//!
+//! and leaves rho v+. A component that would carry the centre over a wall ends at the wall with
+//! velocity 0; the axes do not act on each other. Lava and goal are tested along the straight path
+//! of each substep.
+//!
+//! Ends are a discontinuity in v+. Each node of v+ therefore stands for its cell: [`Events`] holds
+//! the shares of the cell that end in lava and in the goal.
+
+use super::Lattice;
+use lava_envs::point::Rectangle;
+use lava_envs::{End, PointConfig};
+
+/// Sub-samples per axis of a cell of the v+ lattice, for the shares of ends.
+const SAMPLES: usize = 3;
+
+/// How far in m the DP lets the disc into lava before it counts: nodes that lie on the border of
+/// lava or goal are then nodes just outside, and the values beside a border are interpolated between
+/// nodes that all run on.
+const SLACK: f64 = 1e-4;
+
+/// Standard deviations of the noise at which its lattice ends.
+const TAILS: f64 = 4.0;
+
+/// Equally spaced nodes of one position axis.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Axis {
+    /// The first node in m.
+    pub origin: f64,
+    /// Distance of neighbours in m.
+    pub step: f64,
+    /// Number of nodes, at least 2.
+    pub nodes: usize,
+}
+
+impl Axis {
+    fn new(low: f64, high: f64, cell: f64) -> Axis {
+        let intervals = ((high - low) / cell).round().max(1.0);
+        Axis { origin: low, step: (high - low) / intervals, nodes: intervals as usize + 1 }
+    }
+
+    /// Position of a node in m.
+    pub fn at(&self, node: usize) -> f64 {
+        self.origin + self.step * node as f64
+    }
+
+    /// The node below a position and the position's share of the way to the next.
+    pub fn locate(&self, position: f64) -> (usize, f64) {
+        let place = ((position - self.origin) / self.step).clamp(0.0, (self.nodes - 1) as f64);
+        let node = (place as usize).min(self.nodes - 2);
+        (node, place - node as f64)
+    }
+}
+
+/// Where one axis of a step leads, from a node and a node of v+.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Landing {
+    /// The node below.
+    pub node: usize,
+    /// Share of the way to the next node.
+    pub share: f32,
+    /// Index of the velocity afterwards, rho times this node of v+.
+    pub velocity: usize,
+}
+
+/// Shares of the cells of v+ that end, as counts of sub-samples: lava in the high, goal in the low
+/// half of the byte.
+pub type Events = Vec<u8>;
+
+/// A lattice laid over a world.
+#[derive(Debug, Clone)]
+pub struct Space {
+    /// Constants of the world.
+    pub config: PointConfig,
+    /// Position axes x and y.
+    pub axes: [Axis; 2],
+    /// Spacing dv of the velocities in m/s.
+    pub spacing: f64,
+    /// Nodes of v, vbar and v+ on either side of 0.
+    pub halves: Halves,
+    /// Weights of the Gaussian smoothing, of length 2 (plus - mean) + 1, summing to 1.
+    pub kernel: Vec<f32>,
+    /// Displacement in s per unit of v+.
+    pub reach: f64,
+    /// Which end a node itself is, by `x * ny + y`.
+    pub stopped: Vec<Option<End>>,
+    /// Shares of ends by node; empty where no velocity of the lattice ends.
+    pub events: Vec<Events>,
+    /// Landings by `axis`, then `node * (2 plus + 1) + velocity`.
+    pub landings: [Vec<Landing>; 2],
+}
+
+/// Nodes on either side of 0 of the three velocity lattices.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Halves {
+    /// Of v, before the push.
+    pub before: usize,
+    /// Of vbar.
+    pub mean: usize,
+    /// Of v+, after the noise.
+    pub plus: usize,
+}
+
+impl Halves {
+    fn new(config: &PointConfig, spacing: f64) -> Halves {
+        let (rho, sigma, push) = (config.velocity_retention, config.noise, config.acceleration);
+        let drift = push * rho / (1.0 - rho).max(1e-9);
+        let spread = rho * sigma / (1.0 - rho * rho).max(1e-9).sqrt();
+        // Without damping there is no steady drift; faster than this nobody steers.
+        let fastest = (drift + 2.5 * spread).min(4.0 * (push + sigma)).max(spacing);
+        let nodes = |speed: f64| (speed / spacing - 1e-9).ceil().max(0.0) as usize;
+        let before = nodes(fastest).max(2);
+        // Two more for the stencil of the cubic interpolation.
+        let mean = before + nodes(push) + 2;
+        Halves { before, mean, plus: mean + nodes(TAILS * sigma) }
+    }
+}
+
+impl Space {
+    /// Lays a lattice over a valid configuration.
+    pub fn new(config: &PointConfig, lattice: &Lattice, threads: usize) -> Space {
+        let (radius, spacing) = (config.radius, lattice.velocity);
+        let axes = [0, 1].map(|axis| Axis::new(radius, config.arena[axis] - radius, lattice.cell));
+        let halves = Halves::new(config, spacing);
+        let wide = (halves.plus - halves.mean) as i64;
+        let weight = |m: i64| {
+            let z = m as f64 * spacing / config.noise.max(1e-12);
+            if m == 0 { 1.0 } else { (-0.5 * z * z).exp() }
+        };
+        let total: f64 = (-wide..=wide).map(weight).sum();
+        let kernel = (-wide..=wide).map(|m| (weight(m) / total) as f32).collect();
+
+        let substeps = f64::from(config.substeps);
+        let left = config.velocity_retention.powf(1.0 / substeps);
+        let travel: f64 = (0..config.substeps).map(|k| left.powi(k as i32)).sum();
+        let mut space = Space {
+            config: config.clone(),
+            axes,
+            spacing,
+            halves,
+            kernel,
+            reach: config.substep() * travel,
+            stopped: Vec::new(),
+            events: Vec::new(),
+            landings: [Vec::new(), Vec::new()],
+        };
+        space.landings = [0, 1].map(|axis| space.axis_landings(axis));
+        let scene = Scene::new(config);
+        space.stopped = (0..axes[0].nodes * axes[1].nodes)
+            .map(|node| scene.end_at(space.position(node)))
+            .collect();
+        space.events = space.all_events(&scene, threads);
+        space
+    }
+
+    /// Bytes that the tables of so many controllers and the work space of a programme would take.
+    pub fn bytes(config: &PointConfig, lattice: &Lattice, tables: usize) -> f64 {
+        let nodes = |axis: usize| {
+            ((config.arena[axis] - 2.0 * config.radius) / lattice.cell).round().max(1.0) + 1.0
+        };
+        let Halves { mean, plus, .. } = Halves::new(config, lattice.velocity);
+        let square = |half: usize| (2.0 * half as f64 + 1.0).powi(2);
+        let table = f64::from(config.horizon) * square(mean) * 4.0;
+        // V of two times in single precision, and the shares of ends in bytes.
+        nodes(0) * nodes(1) * (table * tables as f64 + square(plus) * 9.0)
+    }
+
+    /// Number of position nodes.
+    pub fn nodes(&self) -> usize {
+        self.axes[0].nodes * self.axes[1].nodes
+    }
+
+    /// Position of a node in m.
+    pub fn position(&self, node: usize) -> [f64; 2] {
+        let ny = self.axes[1].nodes;
+        [self.axes[0].at(node / ny), self.axes[1].at(node % ny)]
+    }
+
+    /// Velocity of a node of v+ in m/s.
+    pub fn plus(&self, index: usize) -> f64 {
+        (index as f64 - self.halves.plus as f64) * self.spacing
+    }
+
+    fn axis_landings(&self, axis: usize) -> Vec<Landing> {
+        let line = self.axes[axis];
+        let (low, high) = (line.origin, line.at(line.nodes - 1));
+        let mut landings = Vec::with_capacity(line.nodes * (2 * self.halves.plus + 1));
+        for node in 0..line.nodes {
+            for index in 0..=2 * self.halves.plus {
+                let goes_to = line.at(node) + self.reach * self.plus(index);
+                let stops = goes_to < low - 1e-9 || goes_to > high + 1e-9;
+                let (below, share) = line.locate(goes_to);
+                landings.push(Landing {
+                    node: below,
+                    share: share as f32,
+                    velocity: if stops { self.halves.plus } else { index },
+                });
+            }
+        }
+        landings
+    }
+
+    fn all_events(&self, scene: &Scene, threads: usize) -> Vec<Events> {
+        let mut events = vec![Vec::new(); self.nodes()];
+        let share = self.nodes().div_ceil(8 * threads).max(1);
+        let queue = std::sync::Mutex::new(events.chunks_mut(share).enumerate());
+        std::thread::scope(|scope| {
+            for _ in 0..threads {
+                scope.spawn(|| {
+                    loop {
+                        let next = queue.lock().expect("no worker panics with the queue").next();
+                        let Some((chunk, events)) = next else { break };
+                        for (index, events) in events.iter_mut().enumerate() {
+                            *events = self.events_of(scene, chunk * share + index);
+                        }
+                    }
+                });
+            }
+        });
+        events
+    }
+
+    fn events_of(&self, scene: &Scene, node: usize) -> Events {
+        let position = self.position(node);
+        let furthest = self.reach * self.spacing * (self.halves.plus + 1) as f64;
+        let around = position.map(|p| [p - furthest, p + furthest]);
+        if self.stopped[node].is_some() || !scene.may_end([around[0], around[1]]) {
+            return Vec::new();
+        }
+        let count = 2 * self.halves.plus + 1;
+        let mut events = Vec::with_capacity(count * count);
+        let offsets: Vec<f64> = (0..SAMPLES)
+            .map(|s| (s as f64 - (SAMPLES - 1) as f64 / 2.0) / SAMPLES as f64 * self.spacing)
+            .collect();
+        for i in 0..count {
+            for j in 0..count {
+                let mut code = 0;
+                for dx in &offsets {
+                    for dy in &offsets {
+                        let velocity = [self.plus(i) + dx, self.plus(j) + dy];
+                        code += match scene.step(&self.config, position, velocity).end {
+                            Some(End::Lava) => 16,
+                            Some(End::Goal) => 1,
+                            _ => 0,
+                        };
+                    }
+                }
+                events.push(code);
+            }
+        }
+        if events.iter().all(|&code| code == 0) { Vec::new() } else { events }
+    }
+}
+
+/// Shares of lava and goal in a code of [`Events`].
+pub fn shares(code: u8) -> (f32, f32) {
+    let all = (SAMPLES * SAMPLES) as f32;
+    (f32::from(code >> 4) / all, f32::from(code & 15) / all)
+}
+
+/// What a control step leads to once v+ is fixed.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Moved {
+    /// Where the centre is, in m; at an end, the point of impact.
+    pub position: [f64; 2],
+    /// Velocity after damping, in m/s.
+    pub velocity: [f64; 2],
+    /// Lava or goal, if the step ends there.
+    pub end: Option<End>,
+}
+
+/// Lava and goal, as the DP sees them.
+#[derive(Debug, Clone)]
+pub struct Scene {
+    lava: Rectangle,
+    goal: Rectangle,
+    radius: f64,
+}
+
+impl Scene {
+    /// The scene of a valid configuration.
+    pub fn new(config: &PointConfig) -> Scene {
+        let Rectangle { min, max } = config.goal;
+        let goal = Rectangle { min: min.map(|c| c + SLACK), max: max.map(|c| c - SLACK) };
+        Scene { lava: config.lava, goal, radius: config.radius - SLACK }
+    }
+
+    /// Which end a centre at rest is in.
+    pub fn end_at(&self, position: [f64; 2]) -> Option<End> {
+        self.first_end(position, [0.0, 0.0]).map(|(_, end)| end)
+    }
+
+    /// Whether a path in the box `[[x_min, x_max], [y_min, y_max]]` may end.
+    fn may_end(&self, [x, y]: [[f64; 2]; 2]) -> bool {
+        let meets = |rectangle: &Rectangle, margin: f64| {
+            x[0] <= rectangle.max[0] + margin
+                && x[1] >= rectangle.min[0] - margin
+                && y[0] <= rectangle.max[1] + margin
+                && y[1] >= rectangle.min[1] - margin
+        };
+        meets(&self.lava, self.radius) || meets(&self.goal, 0.0)
+    }
+
+    /// One control step from a velocity after the noise.
+    pub fn step(&self, config: &PointConfig, position: [f64; 2], velocity: [f64; 2]) -> Moved {
+        let h = config.substep();
+        let left = config.velocity_retention.powf(1.0 / f64::from(config.substeps));
+        let Moved { mut position, mut velocity, .. } = Moved { position, velocity, end: None };
+        for _ in 0..config.substeps {
+            let before = position;
+            for axis in 0..2 {
+                let (low, high) = (config.radius, config.arena[axis] - config.radius);
+                let goes_to = position[axis] + h * velocity[axis];
+                position[axis] = goes_to.clamp(low, high);
+                let stops = goes_to < low - 1e-9 || goes_to > high + 1e-9;
+                velocity[axis] = if stops { 0.0 } else { velocity[axis] * left };
+            }
+            let path = [position[0] - before[0], position[1] - before[1]];
+            if let Some((time, end)) = self.first_end(before, path) {
+                let impact = [before[0] + time * path[0], before[1] + time * path[1]];
+                return Moved { position: impact, velocity, end: Some(end) };
+            }
+        }
+        Moved { position, velocity, end: None }
+    }
+
+    /// The first end on a straight path, with its share of the path; lava if both coincide.
+    fn first_end(&self, from: [f64; 2], path: [f64; 2]) -> Option<(f64, End)> {
+        let line = |axis: usize| {
+            let (a, b) = (from[axis], from[axis] + path[axis]);
+            [a.min(b), a.max(b)]
+        };
+        if !self.may_end([line(0), line(1)]) {
+            return None;
+        }
+        let lava = self.time_to_lava(from, path);
+        let goal = time_to_box(from, path, self.goal.min, self.goal.max);
+        match (lava, goal) {
+            (Some(lava), Some(goal)) if goal < lava => Some((goal, End::Goal)),
+            (Some(lava), _) => Some((lava, End::Lava)),
+            (None, goal) => goal.map(|time| (time, End::Goal)),
+        }
+    }
+
+    /// The centre touches lava in the rectangle grown in x, the one grown in y, or the discs at the
+    /// corners.
+    fn time_to_lava(&self, from: [f64; 2], path: [f64; 2]) -> Option<f64> {
+        let (Rectangle { min, max }, r) = (self.lava, self.radius);
+        let grown_x = time_to_box(from, path, [min[0] - r, min[1]], [max[0] + r, max[1]]);
+        let grown_y = time_to_box(from, path, [min[0], min[1] - r], [max[0], max[1] + r]);
+        let corners = [min, [min[0], max[1]], [max[0], min[1]], max];
+        let corners = corners.iter().filter_map(|&corner| time_to_disc(from, path, corner, r));
+        grown_x.into_iter().chain(grown_y).chain(corners).min_by(f64::total_cmp)
+    }
+}
+
+fn time_to_box(from: [f64; 2], path: [f64; 2], min: [f64; 2], max: [f64; 2]) -> Option<f64> {
+    let (mut enter, mut leave) = (0.0_f64, 1.0_f64);
+    for axis in 0..2 {
+        if path[axis] == 0.0 {
+            if from[axis] < min[axis] || from[axis] > max[axis] {
+                return None;
+            }
+        } else {
+            let a = (min[axis] - from[axis]) / path[axis];
+            let b = (max[axis] - from[axis]) / path[axis];
+            enter = enter.max(a.min(b));
+            leave = leave.min(a.max(b));
+        }
+    }
+    (enter <= leave).then_some(enter)
+}
+
+fn time_to_disc(from: [f64; 2], path: [f64; 2], centre: [f64; 2], radius: f64) -> Option<f64> {
+    let off = [from[0] - centre[0], from[1] - centre[1]];
+    let outside = off[0] * off[0] + off[1] * off[1] - radius * radius;
+    if outside <= 0.0 {
+        return Some(0.0);
+    }
+    // The smaller root of a s^2 + 2 b s + outside = 0.
+    let a = path[0] * path[0] + path[1] * path[1];
+    let b = off[0] * path[0] + off[1] * path[1];
+    let root = b * b - a * outside;
+    if b >= 0.0 || root < 0.0 {
+        return None;
+    }
+    let time = outside / (-b + root.sqrt());
+    (time <= 1.0).then_some(time)
+}
+
+/// Weights of the cubic through four equally spaced nodes -1, 0, 1, 2 at `share` in [0, 1].
+pub fn cubic(share: f64) -> [f32; 4] {
+    let s = share;
+    [
+        -s * (s - 1.0) * (s - 2.0) / 6.0,
+        (s + 1.0) * (s - 1.0) * (s - 2.0) / 2.0,
+        -(s + 1.0) * s * (s - 2.0) / 2.0,
+        (s + 1.0) * s * (s - 1.0) / 6.0,
+    ]
+    .map(|weight| weight as f32)
+}

@@ -1,0 +1,134 @@
+//! Playing a protagonist in the physical world: this, and not the lattice, is what certifies.
+
+use super::controller::Protagonist;
+use crate::game::returns::{Atom, ReturnLaw};
+use lava_envs::law::{GaussianLaw, Law};
+use lava_envs::point::Force;
+use lava_envs::random::{Purpose, stream};
+use lava_envs::{ConfigError, LavaPoint, PointConfig, Step, World};
+use nalgebra::Vector2;
+use std::sync::Mutex;
+
+/// Episodes that are in a world at the same time, and the unit of work of a thread.
+const BATCH: usize = 250;
+
+/// Recorded episodes of a protagonist.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Played {
+    /// The law of J.
+    pub law: ReturnLaw,
+    /// Mean y in m at which episodes first pass the middle of the arena in x; `None` if none does.
+    pub crossing_y: Option<f64>,
+    /// Share of the episodes that pass it.
+    pub crossed: f64,
+}
+
+/// Plays episodes `0..episodes` of a seed under nominal chance. Episode i has its own streams, so the
+/// result depends neither on the number of threads nor on the batch.
+///
+/// # Errors
+/// If the configuration is out of range.
+pub fn play(
+    config: &PointConfig,
+    gamma: f64,
+    protagonist: &dyn Protagonist,
+    episodes: u64,
+    seed: u64,
+    threads: usize,
+) -> Result<Played, ConfigError> {
+    config.validate()?;
+    let blank = Episode {
+        atom: Atom {
+            value: 0.0,
+            undiscounted: 0.0,
+            steps: 0,
+            end: lava_envs::End::Timeout,
+            mass: 0.0,
+        },
+        crossing: None,
+    };
+    let mut records = vec![blank; episodes as usize];
+    let queue = Mutex::new(records.chunks_mut(BATCH).enumerate());
+    std::thread::scope(|scope| {
+        let workers: Vec<_> = (0..threads)
+            .map(|_| {
+                scope.spawn(|| {
+                    loop {
+                        let next = queue.lock().expect("no worker panics with the queue").next();
+                        let Some((batch, records)) = next else { return Ok(()) };
+                        let first = (batch * BATCH) as u64;
+                        play_batch(config, gamma, protagonist, seed, first, records)?;
+                    }
+                })
+            })
+            .collect();
+        workers.into_iter().try_for_each(|worker| worker.join().expect("a worker panicked"))
+    })?;
+    let crossings: Vec<f64> = records.iter().filter_map(|record| record.crossing).collect();
+    Ok(Played {
+        crossing_y: (!crossings.is_empty())
+            .then(|| crossings.iter().sum::<f64>() / crossings.len() as f64),
+        crossed: crossings.len() as f64 / episodes as f64,
+        law: ReturnLaw::recorded(records.into_iter().map(|record| record.atom)),
+    })
+}
+
+#[derive(Debug, Clone, Copy)]
+struct Episode {
+    atom: Atom,
+    crossing: Option<f64>,
+}
+
+fn play_batch(
+    config: &PointConfig,
+    gamma: f64,
+    protagonist: &dyn Protagonist,
+    seed: u64,
+    first: u64,
+    records: &mut [Episode],
+) -> Result<(), ConfigError> {
+    let mut world = LavaPoint::new(config, records.len())?;
+    let streams = |purpose: Purpose| -> Vec<_> {
+        (0..records.len() as u64).map(|index| stream(seed, purpose, first + index)).collect()
+    };
+    let mut chance = streams(Purpose::EvaluationOutcomes);
+    let mut own = streams(Purpose::EvaluationActions);
+    let mut running: Vec<bool> = vec![true; records.len()];
+    let mut actions = vec![Force(Vector2::zeros()); records.len()];
+    let mut outcomes = vec![Vector2::zeros(); records.len()];
+    let mut steps = vec![Step::IDLE; records.len()];
+    let mut before = vec![[0.0, 0.0]; records.len()];
+    let middle = config.arena[0] / 2.0;
+    let mut discount = 1.0;
+    for time in 0..config.horizon {
+        for slot in (0..records.len()).filter(|&slot| running[slot]) {
+            before[slot] = world.position(slot);
+            let velocity = world.velocity(slot);
+            actions[slot] = protagonist.act(time, before[slot], velocity, &mut own[slot]);
+            outcomes[slot] = GaussianLaw.sample(&mut chance[slot]);
+        }
+        world.apply(&actions, &outcomes, &mut steps);
+        for (slot, record) in records.iter_mut().enumerate() {
+            if !running[slot] {
+                continue;
+            }
+            let Episode { atom, crossing } = record;
+            atom.value += discount * steps[slot].reward;
+            atom.undiscounted += steps[slot].reward;
+            atom.steps += 1;
+            let ([x0, y0], [x1, y1]) = (before[slot], world.position(slot));
+            if crossing.is_none() && x0 < middle && x1 >= middle {
+                *crossing = Some(y0 + (y1 - y0) * (middle - x0) / (x1 - x0));
+            }
+            if let Some(end) = steps[slot].end {
+                atom.end = end;
+                running[slot] = false;
+            }
+        }
+        if running.iter().all(|&running| !running) {
+            break;
+        }
+        discount *= gamma;
+    }
+    Ok(())
+}

@@ -1,0 +1,378 @@
+//! The dynamic programme, backwards in time.
+//!
+//! With the utility u of the return (J itself, or -(w - J)^+), acc(t) the reward of t running steps
+//! and R the reward of an end,
+//!
+//!   Q(x, y, v+, t)   = u(acc(t) + gamma^t R) if the step from (x, y) with v+ ends,
+//!                      V(x', y', rho v+ or 0 at a wall, t + 1) if not, and V(., T) = u(acc(T));
+//!   W(x, y, vbar, t) = E Q(x, y, vbar + sigma xi, t),                  xi ~ N(0, I);
+//!   V(x, y, v, t)    = max over |u| <= 1 of W(x, y, v + A u, t).
+//!
+//! While an episode runs its accumulated reward is a function of t, so (s, t) suffices as a state.
+//! V is interpolated linearly in position and by cubics in velocity; W is a product of two
+//! one-dimensional convolutions on the velocity lattice, which for smooth Q and dv <= sigma/2 is
+//! accurate to many digits; the maximum is over the fixed actions of [`actions`], whose stencils are
+//! the same at every node because the lattices of v and vbar are aligned.
+//!
+//! Work is split by columns of the position lattice, each of which reads the later V and writes its
+//! own part: the result does not depend on the number of threads.
+
+use super::lattice::{Space, cubic, shares};
+use lava_envs::{End, PointConfig};
+use std::sync::Mutex;
+
+/// What is maximised in expectation.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Utility {
+    /// J.
+    Return,
+    /// -(w - J)^+ for the threshold w.
+    Shortfall(f64),
+}
+
+impl Utility {
+    /// u(J).
+    pub fn of(self, value: f64) -> f64 {
+        match self {
+            Utility::Return => value,
+            Utility::Shortfall(threshold) => -(threshold - value).max(0.0),
+        }
+    }
+}
+
+/// Rewards as functions of time.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Rewards {
+    /// acc(t) of t running steps, for t = 0..=T.
+    pub running: Vec<f64>,
+    /// gamma^t for t = 0..=T.
+    pub discount: Vec<f64>,
+}
+
+impl Rewards {
+    /// The rewards of a world under gamma.
+    pub fn new(config: &PointConfig, gamma: f64) -> Rewards {
+        let (mut running, mut discount) = (vec![0.0], vec![1.0]);
+        for t in 0..config.horizon as usize {
+            running.push(running[t] - config.step_cost * discount[t]);
+            discount.push(discount[t] * gamma);
+        }
+        Rewards { running, discount }
+    }
+
+    /// The return of an episode whose step at time t ends it with a reward.
+    pub fn ending(&self, time: usize, reward: f64) -> f64 {
+        self.running[time] + self.discount[time] * reward
+    }
+}
+
+/// Rings of pushes: lengths, and directions on each.
+pub type Rings = &'static [(f64, usize)];
+
+/// The pushes that the DP maximises over.
+pub const SWEPT: Rings = &[(1.0, 16), (0.5, 8), (0.0, 1)];
+
+/// Pushes on rings, as vectors u.
+pub fn actions(rings: Rings) -> Vec<[f64; 2]> {
+    let ring = |&(length, count): &(f64, usize)| {
+        (0..count).map(move |k| {
+            let angle = std::f64::consts::TAU * k as f64 / count as f64;
+            [length * angle.cos(), length * angle.sin()]
+        })
+    };
+    rings.iter().flat_map(ring).collect()
+}
+
+/// Cubic interpolation at v + A u, relative to the node of v.
+struct Stencil {
+    /// Offset of the first of four nodes of vbar.
+    offset: [i64; 2],
+    weights: [[f32; 4]; 2],
+}
+
+impl Stencil {
+    fn new(space: &Space, push: [f64; 2]) -> Stencil {
+        let places = push.map(|u| u * space.config.acceleration / space.spacing);
+        let below = places.map(f64::floor);
+        Stencil {
+            offset: below.map(|node| node as i64 - 1),
+            weights: [0, 1].map(|axis| cubic(places[axis] - below[axis])),
+        }
+    }
+}
+
+/// From the nodes of v to velocities rho v+: the first of four nodes, and their weights.
+fn upsampling(space: &Space) -> Vec<(usize, [f32; 4])> {
+    let (half, last) = (space.halves.before as f64, 2 * space.halves.before);
+    (0..=2 * space.halves.plus)
+        .map(|index| {
+            let velocity = space.config.velocity_retention * space.plus(index);
+            let place = (velocity / space.spacing + half).clamp(0.0, last as f64);
+            let first = (place.floor() as usize).clamp(1, last - 2);
+            let share = place - first as f64;
+            // Beyond the outer stencils the cubic is continued, as far as the last node.
+            (first - 1, cubic(share))
+        })
+        .collect()
+}
+
+/// W for all times, and the value at the start.
+#[derive(Debug, Clone)]
+pub struct Swept {
+    /// W by time, node, vbar_x, vbar_y; if not kept, only that of time 0.
+    pub means: Vec<f32>,
+    /// The largest E u(J) from the start, by interpolation; not certified.
+    pub value: f64,
+}
+
+/// Runs the programme. `keep` says whether W of all times is kept, as a controller needs it.
+pub fn sweep(
+    space: &Space,
+    rewards: &Rewards,
+    utility: Utility,
+    threads: usize,
+    keep: bool,
+) -> Swept {
+    let sizes = Sizes::of(space);
+    let programme = Programme {
+        space,
+        sizes,
+        stencils: actions(SWEPT).into_iter().map(|push| Stencil::new(space, push)).collect(),
+        upsampling: upsampling(space),
+    };
+    let horizon = space.config.horizon as usize;
+    let times = if keep { horizon } else { 1 };
+    let nx = space.axes[0].nodes;
+    let column = sizes.ny * sizes.mean * sizes.mean;
+    let mut means = vec![0.0_f32; times * nx * column];
+    let at_limit = utility.of(rewards.running[horizon]) as f32;
+    let slab = sizes.plus * sizes.ny * sizes.plus;
+    let mut later = vec![at_limit; nx * slab];
+    let mut now = vec![0.0_f32; nx * slab];
+    for time in (0..horizon).rev() {
+        let config = &space.config;
+        let ends = Ends {
+            lava: utility.of(rewards.ending(time, config.lava_reward)) as f32,
+            goal: utility.of(rewards.ending(time, config.goal_reward)) as f32,
+        };
+        let place = if keep { time } else { 0 };
+        let here = &mut means[place * nx * column..][..nx * column];
+        let columns = here.chunks_mut(column).zip(now.chunks_mut(slab)).enumerate();
+        let queue = Mutex::new(columns);
+        std::thread::scope(|scope| {
+            for _ in 0..threads {
+                scope.spawn(|| {
+                    let mut work = Work::new(sizes);
+                    loop {
+                        let next = queue.lock().expect("no worker panics with the queue").next();
+                        let Some((x, (means, values))) = next else { break };
+                        programme.column(x, ends, &later, means, values, &mut work);
+                    }
+                });
+            }
+        });
+        std::mem::swap(&mut later, &mut now);
+    }
+    let start = space.config.start;
+    let [(x, fx), (y, fy)] = [0, 1].map(|axis| space.axes[axis].locate(start[axis]));
+    let rest = space.halves.plus;
+    let at =
+        |x: usize, y: usize| f64::from(later[x * slab + (rest * sizes.ny + y) * sizes.plus + rest]);
+    let low = at(x, y) * (1.0 - fy) + at(x, y + 1) * fy;
+    let high = at(x + 1, y) * (1.0 - fy) + at(x + 1, y + 1) * fy;
+    Swept { means, value: low * (1.0 - fx) + high * fx }
+}
+
+/// Utilities of the ends at one time.
+#[derive(Debug, Clone, Copy)]
+struct Ends {
+    lava: f32,
+    goal: f32,
+}
+
+#[derive(Debug, Clone, Copy)]
+struct Sizes {
+    ny: usize,
+    before: usize,
+    mean: usize,
+    plus: usize,
+}
+
+impl Sizes {
+    fn of(space: &Space) -> Sizes {
+        let count = |half: usize| 2 * half + 1;
+        Sizes {
+            ny: space.axes[1].nodes,
+            before: count(space.halves.before),
+            mean: count(space.halves.mean),
+            plus: count(space.halves.plus),
+        }
+    }
+}
+
+/// Work space of a thread.
+struct Work {
+    /// V at x', by y and vy.
+    slab: Vec<f32>,
+    /// Q by y, v+_x, v+_y.
+    outcomes: Vec<f32>,
+    /// Q smoothed in v+_y.
+    half_smooth: Vec<f32>,
+    /// V by v_x, v_y.
+    values: Vec<f32>,
+    row: Vec<f32>,
+    /// V by v_x, rho v+_y.
+    half_up: Vec<f32>,
+}
+
+impl Work {
+    fn new(sizes: Sizes) -> Work {
+        let Sizes { ny, before, mean, plus } = sizes;
+        Work {
+            slab: vec![0.0; ny * plus],
+            outcomes: vec![0.0; ny * plus * plus],
+            half_smooth: vec![0.0; plus * mean],
+            values: vec![0.0; before * before],
+            row: vec![0.0; before + 3],
+            half_up: vec![0.0; before * plus],
+        }
+    }
+}
+
+struct Programme<'a> {
+    space: &'a Space,
+    sizes: Sizes,
+    stencils: Vec<Stencil>,
+    upsampling: Vec<(usize, [f32; 4])>,
+}
+
+impl Programme<'_> {
+    /// All nodes of one x: reads V of the next time in `later`, laid out by x, v_x, y, v_y with v on
+    /// rho times the lattice of v+, and writes W and V of this time.
+    fn column(
+        &self,
+        x: usize,
+        ends: Ends,
+        later: &[f32],
+        means: &mut [f32],
+        values: &mut [f32],
+        work: &mut Work,
+    ) {
+        let Sizes { ny, mean, plus, .. } = self.sizes;
+        self.outcomes(x, later, work);
+        for y in 0..ny {
+            let node = x * ny + y;
+            let means = &mut means[y * mean * mean..][..mean * mean];
+            if let Some(end) = self.space.stopped[node] {
+                let value = if end == End::Lava { ends.lava } else { ends.goal };
+                means.fill(value);
+                for i in 0..plus {
+                    values[(i * ny + y) * plus..][..plus].fill(value);
+                }
+                continue;
+            }
+            let outcomes = &mut work.outcomes[y * plus * plus..][..plus * plus];
+            for (outcome, &code) in outcomes.iter_mut().zip(&self.space.events[node]) {
+                if code != 0 {
+                    let (lava, goal) = shares(code);
+                    *outcome = *outcome * (1.0 - lava - goal) + ends.lava * lava + ends.goal * goal;
+                }
+            }
+            smooth(outcomes, &self.space.kernel, plus, mean, &mut work.half_smooth, means);
+            self.best(means, &mut work.row, &mut work.values);
+            self.upsample(&work.values, &mut work.half_up, y, values);
+        }
+    }
+
+    /// Q of a column but for the ends, by y, v+_x, v+_y.
+    fn outcomes(&self, x: usize, later: &[f32], work: &mut Work) {
+        let Sizes { ny, plus, .. } = self.sizes;
+        let [along_x, along_y] = &self.space.landings;
+        let size = ny * plus;
+        for i in 0..plus {
+            let landing = along_x[x * plus + i];
+            let slab = |x: usize| &later[(x * plus + landing.velocity) * size..][..size];
+            let (low, high) = (slab(landing.node), slab(landing.node + 1));
+            for ((value, low), high) in work.slab.iter_mut().zip(low).zip(high) {
+                *value = low + landing.share * (high - low);
+            }
+            for y in 0..ny {
+                let outcomes = &mut work.outcomes[(y * plus + i) * plus..][..plus];
+                for (outcome, landing) in outcomes.iter_mut().zip(&along_y[y * plus..][..plus]) {
+                    let place = landing.node * plus + landing.velocity;
+                    let (low, high) = (work.slab[place], work.slab[place + plus]);
+                    *outcome = low + landing.share * (high - low);
+                }
+            }
+        }
+    }
+
+    /// V = max over the actions of W at v + A u.
+    fn best(&self, means: &[f32], row: &mut [f32], values: &mut [f32]) {
+        let Sizes { before, mean, .. } = self.sizes;
+        let margin = (self.space.halves.mean - self.space.halves.before) as i64;
+        values.fill(f32::NEG_INFINITY);
+        for Stencil { offset, weights: [across, along] } in &self.stencils {
+            let [first_x, first_y] = offset.map(|offset| (offset + margin) as usize);
+            for (i, values) in values.chunks_exact_mut(before).enumerate() {
+                let line = |p: usize| &means[(i + first_x + p) * mean + first_y..][..before + 3];
+                let (a, b, c, d) = (line(0), line(1), line(2), line(3));
+                for (k, entry) in row.iter_mut().enumerate() {
+                    *entry =
+                        across[0] * a[k] + across[1] * b[k] + across[2] * c[k] + across[3] * d[k];
+                }
+                let [a, b, c, d] = *along;
+                for (k, value) in values.iter_mut().enumerate() {
+                    let here = a * row[k] + b * row[k + 1] + c * row[k + 2] + d * row[k + 3];
+                    *value = if here > *value { here } else { *value };
+                }
+            }
+        }
+    }
+
+    /// From the lattice of v to velocities rho v+, into the column's part at y.
+    fn upsample(&self, values: &[f32], half: &mut [f32], y: usize, up: &mut [f32]) {
+        let Sizes { ny, before, plus, .. } = self.sizes;
+        for (row, half) in values.chunks_exact(before).zip(half.chunks_exact_mut(plus)) {
+            for (entry, (first, weights)) in half.iter_mut().zip(&self.upsampling) {
+                let nodes = &row[*first..][..4];
+                *entry = weights.iter().zip(nodes).map(|(w, v)| w * v).sum();
+            }
+        }
+        for (i, (first, w)) in self.upsampling.iter().enumerate() {
+            let line = |p: usize| &half[(first + p) * plus..][..plus];
+            let (a, b, c, d) = (line(0), line(1), line(2), line(3));
+            let up = &mut up[(i * ny + y) * plus..][..plus];
+            for (k, entry) in up.iter_mut().enumerate() {
+                *entry = w[0] * a[k] + w[1] * b[k] + w[2] * c[k] + w[3] * d[k];
+            }
+        }
+    }
+}
+
+/// W from Q: Gaussian smoothing along both axes, from `plus`^2 to `mean`^2 velocities.
+pub fn smooth(
+    outcomes: &[f32],
+    kernel: &[f32],
+    plus: usize,
+    mean: usize,
+    half: &mut [f32],
+    means: &mut [f32],
+) {
+    for (row, half) in outcomes.chunks_exact(plus).zip(half.chunks_exact_mut(mean)) {
+        half.fill(0.0);
+        for (m, weight) in kernel.iter().enumerate() {
+            for (entry, value) in half.iter_mut().zip(&row[m..]) {
+                *entry += weight * value;
+            }
+        }
+    }
+    for (i, row) in means.chunks_exact_mut(mean).enumerate() {
+        row.fill(0.0);
+        for (m, weight) in kernel.iter().enumerate() {
+            for (entry, value) in row.iter_mut().zip(&half[(i + m) * mean..][..mean]) {
+                *entry += weight * value;
+            }
+        }
+    }
+}
