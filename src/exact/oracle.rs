@@ -9,9 +9,9 @@
 //! | step | file |
 //! |---|---|
 //! | the lattice, and one control step for a velocity after noise | [`lattice`] |
-//! | the programme: smoothing over noise, maximum over pushes | [`sweep`] |
+//! | the programme: smoothing over noise, maximum over pushes | [`mod@sweep`] |
 //! | the controller, and scripted yardsticks | [`controller`] |
-//! | episodes in the physical world | [`play`] |
+//! | episodes in the physical world | [`mod@play`] |
 //!
 //! # The risk level
 //! As on the grid, the best CVaR is a search over thresholds w,
