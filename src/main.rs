@@ -5,8 +5,8 @@ mod cli;
 use clap::Parser;
 use std::process::ExitCode;
 
-/// libtorch allocates a tensor per operation; with small networks glibc's malloc is a third of the
-/// time of an update. `override` makes the libraries use this one as well.
+/// libtorch allocates a tensor per operation. `override` makes the libraries use this allocator as
+/// well.
 #[global_allocator]
 static ALLOCATOR: mimalloc::MiMalloc = mimalloc::MiMalloc;
 
