@@ -1,33 +1,28 @@
 //! The verbs of the command line.
 //!
+//! There are two programs: `cvar-game`, which is not linked to libtorch, and `cvar-game-torch` (crate
+//! `cvar-learn`), to which it hands over what needs the networks.
+//!
 //! Exit codes: 0 done, 1 a run failed, 2 bad input or usage, 130 and 143 stopped by SIGINT and SIGTERM.
 //! Answers go to standard output, progress and errors to standard error.
 
-mod answer;
-mod progress;
+pub mod answer;
 
+use crate::exact::oracle;
+use crate::experiment::config::{
+    Config, ConfigError, Device, Setting, WorldConfig, default_constants,
+};
+use crate::experiment::names::WorldName;
+use crate::game::budget::Eta;
+use crate::{exact, report};
 use anyhow::{Context, Result, bail};
 use clap::{Args, Parser, Subcommand, ValueEnum};
-use cvar_game::exact::oracle;
-use cvar_game::experiment::config::{
-    Config, ConfigError, Device, RunConfig, Setting, WorldConfig, default_constants,
-};
-use cvar_game::experiment::names::WorldName;
-use cvar_game::experiment::plan;
-use cvar_game::experiment::runner::{self, Launcher, Outcome, Prepared, Stop, Workers};
-#[cfg(feature = "torch")]
-use cvar_game::experiment::{artefacts::Chance, runner::InProcess};
-use cvar_game::game::budget::Eta;
-use cvar_game::{exact, report};
-use progress::Progress;
 use std::num::NonZeroUsize;
 use std::path::{Path, PathBuf};
-use std::process::ExitCode;
+use std::process::{Command, ExitCode};
 
-/// Exit code of a program whose runs have failed.
-const FAILED: u8 = 1;
 /// Exit code of usage errors and bad input.
-pub const BAD_INPUT: u8 = 2;
+const BAD_INPUT: u8 = 2;
 
 /// A benchmark for risk-sensitive reinforcement learning by games, with exact yardsticks.
 #[derive(Debug, Parser)]
@@ -46,38 +41,67 @@ Examples:
 )]
 pub struct Cli {
     #[command(subcommand)]
-    verb: Verb,
+    /// What is to be done.
+    pub verb: Verb,
 }
 
+/// A verb.
 #[derive(Debug, Subcommand)]
-enum Verb {
+pub enum Verb {
+    /// What needs the networks.
+    #[command(flatten)]
+    Play(PlayVerb),
+    /// What needs none.
+    #[command(flatten)]
+    Look(LookVerb),
+}
+
+/// What needs the networks: carried out by `cvar-game-torch`.
+#[expect(missing_docs, reason = "the text of a verb stands on its arguments")]
+#[derive(Debug, Subcommand)]
+pub enum PlayVerb {
     Bench(BenchArgs),
     Train(TrainArgs),
     Evaluate(EvaluateArgs),
-    Exact(ExactArgs),
-    Table(TableArgs),
-    Envs(EnvsArgs),
-    Config(PrintArgs),
+    Rollout(RolloutArgs),
     /// Carries out the run of a folder, for `bench`.
     #[command(hide = true)]
     Worker {
+        /// Folder of the run.
         #[arg(long)]
         folder: PathBuf,
     },
 }
 
+/// What needs none: solving the worlds, reports.
+#[expect(missing_docs, reason = "the text of a verb stands on its arguments")]
+#[derive(Debug, Subcommand)]
+pub enum LookVerb {
+    Exact(ExactArgs),
+    Table(TableArgs),
+    Envs(EnvsArgs),
+    Config(PrintArgs),
+}
+
 /// Which configuration.
 #[derive(Debug, Args)]
-struct Overrides {
+pub struct Overrides {
     /// Sets one option over file and default; the value is TOML. `env.KEY` means that key in every
     /// selected world that has it. May be repeated; a later one wins.
     #[arg(long = "set", value_name = "KEY=VALUE")]
-    settings: Vec<String>,
+    pub settings: Vec<String>,
 }
 
 impl Overrides {
     /// The configuration of these overrides, with `options` of the command line over them.
-    fn resolve(&self, file: Option<&Path>, options: Vec<Setting>) -> Result<Config, ConfigError> {
+    ///
+    /// # Errors
+    /// If a setting is not one, or a key or value is refused.
+    pub fn resolve(
+        &self,
+        file: Option<&Path>,
+        options: Vec<Setting>,
+    ) -> Result<Config, ConfigError> {
         let settings: Result<Vec<Setting>, _> =
             self.settings.iter().map(|text| Setting::parse(text)).collect();
         let mut settings = settings?;
@@ -95,21 +119,22 @@ Examples:
   cvar-game bench --config configs/quick.toml
   cvar-game bench --config configs/paper.toml --out results/slippery --set env.slip=0.1
   cvar-game bench --config configs/quick.toml --jobs 1 --set 'experiment.seeds=[1]' --out /tmp/try")]
-struct BenchArgs {
+pub struct BenchArgs {
     /// Configuration file.
     #[arg(long, value_name = "FILE")]
-    config: PathBuf,
+    pub config: PathBuf,
     /// Output folder [default: results/ and the name of the configuration file].
     #[arg(long, value_name = "DIR")]
-    out: Option<PathBuf>,
+    pub out: Option<PathBuf>,
     /// Runs at the same time, one thread each [default: the processor's cores].
     #[arg(long, value_name = "N", value_parser = at_least_one)]
-    jobs: Option<NonZeroUsize>,
+    pub jobs: Option<NonZeroUsize>,
     /// Device of the networks: cpu, cuda or cuda:N.
     #[arg(long)]
-    device: Option<Device>,
+    pub device: Option<Device>,
+    /// Options set on the command line.
     #[command(flatten)]
-    overrides: Overrides,
+    pub overrides: Overrides,
 }
 
 /// Train and evaluate one run.
@@ -118,33 +143,34 @@ struct BenchArgs {
 Examples:
   cvar-game train --env lava-grid --eta 25 --seed 1 --steps 1000000
   cvar-game train --env lava-point --eta 1 --seed 7 --set train.protagonist.minibatch=500 --json")]
-struct TrainArgs {
+pub struct TrainArgs {
     /// World: lava-grid or lava-point.
     #[arg(long)]
-    env: WorldName,
+    pub env: WorldName,
     /// Budget, at least 1; the risk level is alpha = 1/eta.
     #[arg(long, allow_negative_numbers = true)]
-    eta: f64,
+    pub eta: f64,
     /// Seed of all that is random, a whole number from 0.
     #[arg(long, allow_negative_numbers = true, value_parser = clap::value_parser!(i64).range(0..))]
-    seed: i64,
+    pub seed: i64,
     /// Environment steps.
     #[arg(long, allow_negative_numbers = true)]
-    steps: Option<i64>,
+    pub steps: Option<i64>,
     /// Configuration file.
     #[arg(long, value_name = "FILE")]
-    config: Option<PathBuf>,
+    pub config: Option<PathBuf>,
     /// Output folder; the run gets its own folder in it.
     #[arg(long, value_name = "DIR", default_value = "results/train")]
-    out: PathBuf,
+    pub out: PathBuf,
     /// Device of the networks: cpu, cuda or cuda:N.
     #[arg(long)]
-    device: Option<Device>,
+    pub device: Option<Device>,
     /// End with one JSON object on standard output.
     #[arg(long)]
-    json: bool,
+    pub json: bool,
+    /// Options set on the command line.
     #[command(flatten)]
-    overrides: Overrides,
+    pub overrides: Overrides,
 }
 
 /// Play episodes with the players of a finished run.
@@ -153,43 +179,85 @@ struct TrainArgs {
 Examples:
   cvar-game evaluate results/quick/lava-grid/eta-25/seed-1
   cvar-game evaluate results/quick/lava-point/eta-25/seed-1 --antagonist learned --episodes 1000000")]
-struct EvaluateArgs {
+pub struct EvaluateArgs {
     /// Folder of the run.
     #[arg(value_name = "RUN_DIR")]
-    folder: PathBuf,
+    pub folder: PathBuf,
     /// Who decides the law of chance.
     #[arg(long, value_enum, default_value_t = Antagonist::Nominal)]
-    antagonist: Antagonist,
+    pub antagonist: Antagonist,
     /// Episodes of each play [default: as the run was evaluated].
     #[arg(long, value_parser = clap::value_parser!(u64).range(1..))]
-    episodes: Option<u64>,
+    pub episodes: Option<u64>,
     /// Seed of the episodes [default: as the run was evaluated].
     #[arg(long)]
-    seed: Option<u64>,
+    pub seed: Option<u64>,
     /// Answer as JSON.
     #[arg(long)]
-    json: bool,
+    pub json: bool,
 }
 
+/// Play episodes with the players of a finished run and write every step of them.
+///
+/// A row per step, to standard output. CSV: `episode`, `t`, what the world's state is before the step
+/// (grid: `x`, `y`, in cells; point: `x`, `y` in m, `vx`, `vy` in m/s), the chosen `action` (point:
+/// `action_x`, `action_y`, before it is scaled onto the unit disc), what chance decided (grid:
+/// `executed`, the move; point: `xi_x`, `xi_y`, the noise), its likelihood ratio `delta`, the remaining
+/// `budget` before the step, `reward`, `clearance` to lava after the step, and how the episode `end`ed
+/// with it (`goal`, `lava`, `timeout`, or nothing). JSON: an object per step and line, with these names.
+#[derive(Debug, Args)]
+#[command(after_help = "\
+Examples:
+  cvar-game rollout --run results/quick/lava-grid/eta-25/seed-1 --episodes 1000 > episodes.csv
+  cvar-game rollout --run results/quick/lava-point/eta-25/seed-1 --antagonist learned --format json")]
+pub struct RolloutArgs {
+    /// Folder of the run.
+    #[arg(long, value_name = "DIR")]
+    pub run: PathBuf,
+    /// Number of episodes.
+    #[arg(long, default_value_t = 100, value_parser = clap::value_parser!(u64).range(1..))]
+    pub episodes: u64,
+    /// Format of the rows.
+    #[arg(long, value_enum, default_value_t = RowFormat::Csv)]
+    pub format: RowFormat,
+    /// How the protagonist picks its actions.
+    #[arg(long, value_enum, default_value_t = Picking::Greedy)]
+    pub protagonist: Picking,
+    /// Who decides the law of chance.
+    #[arg(long, value_enum, default_value_t = Antagonist::Nominal)]
+    pub antagonist: Antagonist,
+    /// Seed of the episodes [default: as the run was evaluated].
+    #[arg(long)]
+    pub seed: Option<u64>,
+}
+
+/// Format of rows.
 #[derive(Debug, Clone, Copy, ValueEnum)]
-enum Antagonist {
+pub enum RowFormat {
+    /// A table with a head.
+    Csv,
+    /// An object per line.
+    Json,
+}
+
+/// How the protagonist picks its actions.
+#[derive(Debug, Clone, Copy, ValueEnum)]
+pub enum Picking {
+    /// The mode of its policy.
+    Greedy,
+    /// A draw from its policy.
+    Sampled,
+}
+
+/// Who decides the law of chance.
+#[derive(Debug, Clone, Copy, ValueEnum)]
+pub enum Antagonist {
     /// None: chance follows its nominal law.
     Nominal,
     /// The antagonist that was trained with the protagonist.
     Learned,
     /// The exact worst case for the greedy protagonist (lava-grid).
     Exact,
-}
-
-#[cfg(feature = "torch")]
-impl From<Antagonist> for Chance {
-    fn from(antagonist: Antagonist) -> Self {
-        match antagonist {
-            Antagonist::Nominal => Chance::Nominal,
-            Antagonist::Learned => Chance::Antagonist,
-            Antagonist::Exact => Chance::Exact,
-        }
-    }
 }
 
 /// Solve a world: the best CVaR there is, and how to reach it.
@@ -203,40 +271,41 @@ Examples:
   cvar-game exact --env lava-grid --eta 25
   cvar-game exact --env lava-grid --eta 100 --set env.slip=0.1 --json
   cvar-game exact --env lava-point --eta 25")]
-struct ExactArgs {
+pub struct ExactArgs {
     /// World: lava-grid or lava-point.
     #[arg(long)]
-    env: WorldName,
+    pub env: WorldName,
     /// Budget, at least 1; the risk level is alpha = 1/eta.
     #[arg(long, allow_negative_numbers = true)]
-    eta: f64,
+    pub eta: f64,
     /// Configuration file.
     #[arg(long, value_name = "FILE")]
-    config: Option<PathBuf>,
+    pub config: Option<PathBuf>,
     /// Answer as JSON.
     #[arg(long)]
-    json: bool,
+    pub json: bool,
+    /// Options set on the command line.
     #[command(flatten)]
-    overrides: Overrides,
+    pub overrides: Overrides,
 }
 
 /// Make the table of results of a folder again and print it.
 #[derive(Debug, Args)]
-struct TableArgs {
+pub struct TableArgs {
     /// Output folder of `bench` or `train`.
     #[arg(value_name = "DIR")]
-    folder: PathBuf,
+    pub folder: PathBuf,
     /// Print the table as JSON and write nothing.
     #[arg(long)]
-    json: bool,
+    pub json: bool,
 }
 
 /// List the worlds with their constants.
 #[derive(Debug, Args)]
-struct EnvsArgs {
+pub struct EnvsArgs {
     /// Answer as JSON.
     #[arg(long)]
-    json: bool,
+    pub json: bool,
 }
 
 /// Print the resolved configuration as TOML.
@@ -245,212 +314,104 @@ struct EnvsArgs {
 Examples:
   cvar-game config --config configs/quick.toml
   cvar-game config --env lava-point --set env.noise=2 > windy.toml")]
-struct PrintArgs {
+pub struct PrintArgs {
     /// Configuration file.
     #[arg(long, value_name = "FILE")]
-    config: Option<PathBuf>,
+    pub config: Option<PathBuf>,
     /// This world alone.
     #[arg(long)]
-    env: Option<WorldName>,
+    pub env: Option<WorldName>,
+    /// Options set on the command line.
     #[command(flatten)]
-    overrides: Overrides,
+    pub overrides: Overrides,
 }
 
 fn at_least_one(text: &str) -> Result<NonZeroUsize, String> {
     text.parse().map_err(|_| "use a whole number of at least 1".to_owned())
 }
 
-/// Carries out what the command line asks for.
+/// Carries out what the command line asks for, and hands over to the program beside this one what
+/// needs the networks: loading libtorch takes longer than solving the grid.
 ///
 /// # Errors
 /// On bad input, before anything is overwritten.
 pub fn run(cli: Cli) -> Result<ExitCode> {
     match cli.verb {
-        Verb::Bench(args) => bench(&args),
-        Verb::Train(args) => train(&args),
-        Verb::Evaluate(args) => evaluate(&args),
-        Verb::Exact(args) => exact(&args),
-        Verb::Table(args) => table(&args),
-        Verb::Envs(args) => envs(&args),
-        Verb::Config(args) => {
-            let options = args.env.map(select).into_iter().collect();
-            let config = args.overrides.resolve(args.config.as_deref(), options)?;
-            answer::print(&config.to_toml())
-        }
-        Verb::Worker { folder } => {
-            Ok(if runner::work(&folder) { ExitCode::SUCCESS } else { ExitCode::from(FAILED) })
-        }
+        Verb::Look(verb) => look(verb),
+        Verb::Play(_) => hand_over(),
     }
 }
 
-fn bench(args: &BenchArgs) -> Result<ExitCode> {
-    let options = args.device.map(device).into_iter().collect();
-    let config = args.overrides.resolve(Some(&args.config), options)?;
-    let out = match &args.out {
-        Some(out) => out.clone(),
-        None => {
-            Path::new("results").join(args.config.file_stem().context("--config names no file")?)
-        }
+/// The program that plays, beside this one.
+const PLAYER: &str = "cvar-game-torch";
+/// What both programs were built from.
+const BUILD: &str = env!("CVAR_GAME_BUILD");
+/// How the one tells it to the other.
+const BUILD_VARIABLE: &str = "CVAR_GAME_BUILD";
+
+/// Becomes the program that plays.
+fn hand_over() -> Result<ExitCode> {
+    let this = std::env::current_exe().context("the system does not tell this program's path")?;
+    let player = this.with_file_name(format!("{PLAYER}{}", std::env::consts::EXE_SUFFIX));
+    if !player.exists() {
+        bail!(
+            "training and playing need {}, which is not there; run `cargo xtask setup`, then \
+             `cargo build --release`, which makes both programs",
+            player.display()
+        );
+    }
+    let mut command = Command::new(&player);
+    command.args(std::env::args_os().skip(1)).env(BUILD_VARIABLE, BUILD);
+    #[cfg(unix)]
+    let error = std::os::unix::process::CommandExt::exec(&mut command);
+    #[cfg(not(unix))]
+    let error = match command.status() {
+        Ok(status) => return Ok(ExitCode::from(status.code().unwrap_or(1) as u8)),
+        Err(error) => error,
     };
-    let prepared = prepare(&config, &out)?;
-    let jobs = match args.jobs {
-        Some(jobs) => jobs,
-        None => std::thread::available_parallelism().unwrap_or(NonZeroUsize::MIN),
-    };
-    let stop = Stop::on_signals().context("cannot listen to signals")?;
-    let outcome = sweep(&prepared, jobs, &Workers::of_this_program()?, &stop);
-    if let Some(signal) = outcome.stopped {
-        eprintln!("stopped; finished runs are kept, and the same command goes on with the rest");
-        return Ok(ExitCode::from(128 + signal as u8));
-    }
-    let code = tell_failures(&outcome);
-    if code == ExitCode::SUCCESS || outcome.finished > 0 {
-        answer::print(&report::write(&out)?)?;
-        eprintln!("written to {}", out.display());
-    }
-    Ok(code)
+    Err(error).with_context(|| format!("cannot start {}", player.display()))
 }
 
-fn train(args: &TrainArgs) -> Result<ExitCode> {
-    let mut options = vec![
-        select(args.env),
-        budget(args.eta)?,
-        Setting::option("--seed", "experiment.seeds", vec![args.seed]),
-    ];
-    options.extend(args.steps.map(|steps| Setting::option("--steps", "train.steps", steps)));
-    options.extend(args.device.map(device));
-    let config = args.overrides.resolve(args.config.as_deref(), options)?;
-    let id = plan::runs(&config)[0];
-    let prepared = prepare(&config, &args.out)?;
-    let outcome = if prepared.todo.is_empty() {
-        eprintln!("{id} has finished before; remove its folder to run it again");
-        Outcome::default()
-    } else {
-        Stop::by_ending_the_process().context("cannot listen to signals")?;
-        sweep(&prepared, NonZeroUsize::MIN, &InProcess, &Stop::default())
-    };
-    let folder = id.folder(&args.out);
-    let code = tell_failures(&outcome);
-    match runner::read_evaluation(&folder)? {
-        Some(evaluation) if code == ExitCode::SUCCESS => {
-            let summary = answer::Summary::new(&evaluation, &folder);
-            answer::give(&summary, args.json)
-        }
-        _ => Ok(code),
-    }
-}
-
-/// Checks everything that can be checked before the first run starts.
-fn prepare(config: &Config, out: &Path) -> Result<Prepared> {
-    let prepared = runner::prepare(config, out)?;
-    if !prepared.todo.is_empty() {
-        require_device(config.device)?;
-    }
-    Ok(prepared)
-}
-
-/// Carries out the runs with progress on standard error.
-fn sweep(prepared: &Prepared, jobs: NonZeroUsize, launcher: &dyn Launcher, stop: &Stop) -> Outcome {
-    let mut progress = Progress::new(prepared.todo.len(), prepared.finished.len());
-    let outcome = runner::sweep(prepared, jobs, launcher, stop, &mut |event| progress.event(event));
-    progress.finish();
-    outcome
-}
-
-fn tell_failures(outcome: &Outcome) -> ExitCode {
-    for (run, reason) in &outcome.failed {
-        eprintln!("error: {run} failed: {reason}");
-    }
-    if outcome.failed.is_empty() { ExitCode::SUCCESS } else { ExitCode::from(FAILED) }
-}
-
-fn select(world: WorldName) -> Setting {
-    Setting::option("--env", "experiment.envs", vec![world.as_str()])
-}
-
-fn budget(eta: f64) -> Result<Setting> {
-    let eta = Eta::new(eta).context("--eta")?;
-    Ok(Setting::option("--eta", "experiment.etas", vec![eta.get()]))
-}
-
-fn device(device: Device) -> Setting {
-    Setting::option("--device", "device", device.to_string())
-}
-
-#[cfg(feature = "torch")]
-fn require_device(device: Device) -> Result<()> {
-    if let Device::Cuda(number) = device {
-        let devices = tch::Cuda::device_count();
-        if number as i64 >= devices {
-            bail!(
-                "device {device} is not there: libtorch sees {devices} CUDA devices; use --device \
-                 cpu, or build against a libtorch with CUDA (set LIBTORCH to it) on a machine that \
-                 has the device"
-            );
-        }
+/// For the program that plays: refuses to work for a `cvar-game` of other sources.
+///
+/// # Errors
+/// If the two are not of one build.
+pub fn check_build() -> Result<()> {
+    if std::env::var(BUILD_VARIABLE).is_ok_and(|build| build != BUILD) {
+        bail!("cvar-game and {PLAYER} beside it are not of one build; run `cargo build --release`");
     }
     Ok(())
 }
 
-#[cfg(not(feature = "torch"))]
-fn require_device(_: Device) -> Result<()> {
-    bail!("{NO_TORCH}")
-}
-
-#[cfg(not(feature = "torch"))]
-const NO_TORCH: &str = "this build has no torch, so it cannot train or play; run `cargo xtask setup` \
-                        and build with the default features";
-
-#[cfg(not(feature = "torch"))]
-struct InProcess;
-
-#[cfg(not(feature = "torch"))]
-impl Launcher for InProcess {
-    fn launch(
-        &self,
-        _: &RunConfig,
-        _: &Path,
-        _: &Stop,
-        _: &mut dyn FnMut(runner::Tick),
-    ) -> Result<(), runner::Failure> {
-        Err(runner::Failure::Failed(NO_TORCH.to_owned()))
+/// Carries out what needs no network.
+///
+/// # Errors
+/// On bad input, before anything is overwritten.
+pub fn look(verb: LookVerb) -> Result<ExitCode> {
+    match verb {
+        LookVerb::Exact(args) => exact(&args),
+        LookVerb::Table(args) => table(&args),
+        LookVerb::Envs(args) => envs(&args),
+        LookVerb::Config(args) => {
+            let options = args.env.map(select).into_iter().collect();
+            let config = args.overrides.resolve(args.config.as_deref(), options)?;
+            answer::print(&config.to_toml())
+        }
     }
 }
 
-#[cfg(feature = "torch")]
-fn evaluate(args: &EvaluateArgs) -> Result<ExitCode> {
-    use cvar_game::experiment::evaluation::{Request, evaluate_run};
-    let request =
-        Request { chance: args.antagonist.into(), episodes: args.episodes, seed: args.seed };
-    let run = read_run(&args.folder)?;
-    require_device(run.device)?;
-    let plays = evaluate_run(&args.folder, &request)?;
-    answer::give(&answer::Plays::new(run.id(), &plays, &run.evaluation.alphas), args.json)
+/// The option `--env`.
+pub fn select(world: WorldName) -> Setting {
+    Setting::option("--env", "experiment.envs", vec![world.as_str()])
 }
 
-#[cfg(not(feature = "torch"))]
-fn evaluate(args: &EvaluateArgs) -> Result<ExitCode> {
-    read_run(&args.folder)?;
-    bail!("{NO_TORCH}")
-}
-
-/// The configuration of a finished run.
-fn read_run(folder: &Path) -> Result<RunConfig> {
-    let path = folder.join("config.toml");
-    if !path.exists() {
-        bail!(
-            "{} holds no run; give the folder of one, such as results/quick/lava-grid/eta-25/seed-1",
-            folder.display()
-        );
-    }
-    let run = RunConfig::load(&path)?;
-    if runner::read_evaluation(folder)?.is_none() {
-        bail!(
-            "the run in {} has not finished; go on with the `bench` or `train` that began it",
-            folder.display()
-        );
-    }
-    Ok(run)
+/// The option `--eta`.
+///
+/// # Errors
+/// If it is no budget.
+pub fn budget(eta: f64) -> Result<Setting> {
+    let eta = Eta::new(eta).context("--eta")?;
+    Ok(Setting::option("--eta", "experiment.etas", vec![eta.get()]))
 }
 
 fn exact(args: &ExactArgs) -> Result<ExitCode> {
@@ -496,8 +457,16 @@ fn envs(args: &EnvsArgs) -> Result<ExitCode> {
     answer::print_json(&constants)
 }
 
+/// The exit code of a result; an error is told in one line.
+pub fn tell(result: Result<ExitCode>) -> ExitCode {
+    result.unwrap_or_else(|error| {
+        eprintln!("error: {}", one_line(&error));
+        ExitCode::from(BAD_INPUT)
+    })
+}
+
 /// An error and its causes in one line.
-pub fn one_line(error: &anyhow::Error) -> String {
+fn one_line(error: &anyhow::Error) -> String {
     let mut line = String::new();
     for cause in error.chain() {
         let cause = cause.to_string();

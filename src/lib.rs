@@ -4,8 +4,9 @@
 //! chance within a multiplicative budget eta over the whole trajectory. At equilibrium the
 //! protagonist maximises CVaR_alpha of its return at alpha = 1/eta (arXiv 2109.09470).
 
+pub mod cli;
 pub mod exact;
 pub mod experiment;
 pub mod game;
-pub mod learn;
+pub mod options;
 pub mod report;

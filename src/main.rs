@@ -1,21 +1,10 @@
-//! The command line program: parse, run, and say in one line what went wrong.
-
-mod cli;
+//! The command line program. It is not linked to libtorch, whose loading takes a third of a second:
+//! what needs the networks is handed over to `cvar-game-torch` beside it.
 
 use clap::Parser;
+use cvar_game::cli;
 use std::process::ExitCode;
 
-/// libtorch allocates a tensor per operation. `override` makes the libraries use this allocator as
-/// well.
-#[global_allocator]
-static ALLOCATOR: mimalloc::MiMalloc = mimalloc::MiMalloc;
-
 fn main() -> ExitCode {
-    match cli::run(cli::Cli::parse()) {
-        Ok(code) => code,
-        Err(error) => {
-            eprintln!("error: {}", cli::one_line(&error));
-            ExitCode::from(cli::BAD_INPUT)
-        }
-    }
+    cli::tell(cli::run(cli::Cli::parse()))
 }

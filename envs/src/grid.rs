@@ -104,6 +104,11 @@ impl Move {
         self as usize
     }
 
+    /// The move in a word, as in files.
+    pub fn name(self) -> &'static str {
+        ["up", "down", "right", "left"][self.index()]
+    }
+
     /// The move of an index.
     ///
     /// # Panics

@@ -19,7 +19,7 @@ mod rules;
 use super::artefacts::SCHEMA;
 use super::names::{RunId, WorldName};
 use crate::game::budget::Eta;
-use crate::learn::options::{Credit, TrainOptions};
+use crate::options::{Credit, TrainOptions};
 use lava_envs::{grid::GridConfig, point::PointConfig};
 use layers::Layer;
 use serde::de::DeserializeOwned;

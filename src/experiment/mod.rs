@@ -10,12 +10,6 @@
 
 pub mod artefacts;
 pub mod config;
-#[cfg(feature = "torch")]
-pub mod evaluation;
-#[cfg(feature = "torch")]
-pub mod failure;
 pub mod names;
 pub mod plan;
-#[cfg(feature = "torch")]
-pub mod run;
 pub mod runner;

@@ -22,9 +22,7 @@ use std::sync::{Arc, Mutex, mpsc};
 use std::time::Instant;
 use thiserror::Error;
 
-#[cfg(feature = "torch")]
-pub use worker::InProcess;
-pub use worker::{Workers, work};
+pub use worker::{CarryOut, InProcess, Workers, work};
 
 /// How far a run is.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]

@@ -1,10 +1,10 @@
 //! A world with the heads of its two players.
 
-use crate::game::finite::FiniteFamily;
-use crate::game::gaussian::GaussianFamily;
-use crate::game::perturbation::Family;
-use crate::learn::head::{CategoricalPolicy, GaussianPolicy, Policy};
-use crate::learn::options::TrainOptions;
+use crate::head::{CategoricalPolicy, GaussianPolicy, Policy};
+use cvar_game::game::finite::FiniteFamily;
+use cvar_game::game::gaussian::GaussianFamily;
+use cvar_game::game::perturbation::Family;
+use cvar_game::options::TrainOptions;
 use lava_envs::{LavaGrid, LavaPoint, Law, Move, World};
 
 /// What the game needs to know of a world beside its dynamics.

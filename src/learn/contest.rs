@@ -4,11 +4,11 @@
 //! Training and evaluation both step through here; this is the only place where what the worlds
 //! show becomes the players' inputs.
 
-use crate::game::budget::{Budget, Eta};
-use crate::game::perturbation::{Family, Perturbation};
-use crate::learn::arena::Arena;
-use crate::learn::head::Policy;
-use crate::learn::pair::{Pair, Protagonist, Views};
+use crate::arena::Arena;
+use crate::head::Policy;
+use crate::pair::{Pair, Protagonist, Views};
+use cvar_game::game::budget::{Budget, Eta};
+use cvar_game::game::perturbation::{Family, Perturbation};
 use lava_envs::random::ChaCha8Rng;
 use lava_envs::{Law, Step};
 

@@ -5,8 +5,8 @@
 //! heads are the categorical and the Gaussian policy. The antagonist's policy IS the perturbed law
 //! of chance and its action IS the realised outcome, so its head wraps a family of perturbations.
 
-use crate::game::budget::Budget;
-use crate::game::perturbation::{Family, Perturbation};
+use cvar_game::game::budget::Budget;
+use cvar_game::game::perturbation::{Family, Perturbation};
 use lava_envs::law::{Law, MOVES, sample_index};
 use lava_envs::{Force, Move};
 use nalgebra::Vector2;

@@ -1,10 +1,10 @@
 //! The two players of a game, and what each of them sees.
 
-use crate::game::budget::{Budget, Eta};
-use crate::learn::arena::Arena;
-use crate::learn::head::AntagonistHead;
-use crate::learn::options::{Role, TrainOptions};
-use crate::learn::ppo::Player;
+use crate::arena::Arena;
+use crate::head::AntagonistHead;
+use crate::ppo::Player;
+use cvar_game::game::budget::{Budget, Eta};
+use cvar_game::options::{Role, TrainOptions};
 use lava_envs::World;
 use lava_envs::random::{Purpose, stream};
 use tch::Device;

@@ -4,11 +4,11 @@
 //! policies meet the same chance (common random numbers), and no episode depends on how many are
 //! played at once.
 
-use crate::game::budget::Eta;
-use crate::game::returns::{Atom, ReturnLaw};
-use crate::learn::arena::Arena;
-use crate::learn::contest::{Chance, Choosing, Contest, Streams};
-use crate::learn::pair::Pair;
+use crate::arena::Arena;
+use crate::contest::{Chance, Choosing, Contest, Streams};
+use crate::pair::Pair;
+use cvar_game::game::budget::Eta;
+use cvar_game::game::returns::{Atom, ReturnLaw};
 use lava_envs::random::{Purpose, stream};
 
 /// What is played.
@@ -75,8 +75,30 @@ impl Played {
     }
 }
 
+/// Somebody who is shown every step of every episode. Steps of one episode come in order, those of
+/// different episodes in between each other.
+pub trait Watcher<W: Arena> {
+    /// The world before the next step of the episode in the slot.
+    fn before(&mut self, world: &W, slot: usize);
+
+    /// What happened in that step of the episode; the world is the one after it.
+    fn after(&mut self, contest: &Contest<W>, slot: usize, episode: usize);
+}
+
+/// Nobody.
+impl<W: Arena> Watcher<W> for () {
+    fn before(&mut self, _: &W, _: usize) {}
+
+    fn after(&mut self, _: &Contest<W>, _: usize, _: usize) {}
+}
+
 /// Plays the episodes in the slots of `world`; a slot takes the next episode when its own has ended.
-pub fn play<W: Arena>(world: W, pair: &Pair<W>, play: &Play<'_, W>) -> Played {
+pub fn play<W: Arena>(
+    world: W,
+    pair: &Pair<W>,
+    play: &Play<'_, W>,
+    watcher: &mut impl Watcher<W>,
+) -> Played {
     let slots = world.episodes();
     let mut contest =
         Contest::new(world, (0..slots as u64).map(|i| play.streams(i)).collect(), &pair.views);
@@ -90,11 +112,15 @@ pub fn play<W: Arena>(world: W, pair: &Pair<W>, play: &Play<'_, W>) -> Played {
         contest.idle[slot] = episode >= played.len();
     }
     while contest.idle.iter().any(|idle| !idle) {
+        for slot in (0..slots).filter(|&slot| !contest.idle[slot]) {
+            watcher.before(&contest.world, slot);
+        }
         contest.step(pair, play.choosing, &play.chance);
         for (slot, index) in current.iter_mut().enumerate() {
             if contest.idle[slot] {
                 continue;
             }
+            watcher.after(&contest, slot, *index);
             let episode = &mut played[*index];
             let step = contest.steps[slot];
             episode.atom.value += play.gamma.powi(episode.atom.steps as i32) * step.reward;

@@ -10,12 +10,12 @@
 //! Its gradient by the outputs of actor and critic is written out in [`loss`]; the networks carry it
 //! to the parameters.
 
-use crate::learn::adam::Adam;
-use crate::learn::gae;
-use crate::learn::head::{Head, MAX_PARAMETERS};
-use crate::learn::network::{Network, Shape};
-use crate::learn::options::PlayerOptions;
-use crate::learn::trajectories::Trajectories;
+use crate::adam::Adam;
+use crate::gae;
+use crate::head::{Head, MAX_PARAMETERS};
+use crate::network::{Network, Shape};
+use crate::trajectories::Trajectories;
+use cvar_game::options::PlayerOptions;
 use lava_envs::random::ChaCha8Rng;
 use rand::seq::SliceRandom;
 use tch::Device;

@@ -1,13 +1,13 @@
 //! Rollouts: a fixed number of steps of parallel games, recorded for both players.
 
-use crate::game::budget::Eta;
-use crate::game::returns::Atom;
-use crate::learn::arena::Arena;
-use crate::learn::contest::{Chance, Choosing, Contest, Streams};
-use crate::learn::head::{AntagonistHead, Head};
-use crate::learn::options::Credit;
-use crate::learn::pair::Pair;
-use crate::learn::trajectories::Trajectories;
+use crate::arena::Arena;
+use crate::contest::{Chance, Choosing, Contest, Streams};
+use crate::head::{AntagonistHead, Head};
+use crate::pair::Pair;
+use crate::trajectories::Trajectories;
+use cvar_game::game::budget::Eta;
+use cvar_game::game::returns::Atom;
+use cvar_game::options::Credit;
 use lava_envs::random::{Purpose, stream};
 use lava_envs::{End, Law};
 

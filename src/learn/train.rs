@@ -1,11 +1,11 @@
 //! Algorithm 1 of the paper: the two players are updated in turn, each on a fresh rollout.
 
-use crate::game::budget::Eta;
-use crate::learn::arena::Arena;
-use crate::learn::options::{PlayerOptions, Role, TrainOptions};
-use crate::learn::pair::Pair;
-use crate::learn::ppo::{Losses, Rates};
-use crate::learn::rollout::Collector;
+use crate::arena::Arena;
+use crate::pair::Pair;
+use crate::ppo::{Losses, Rates};
+use crate::rollout::Collector;
+use cvar_game::game::budget::Eta;
+use cvar_game::options::{PlayerOptions, Role, TrainOptions};
 use lava_envs::End;
 use lava_envs::random::{Purpose, stream};
 use tch::Device;

@@ -1,6 +1,6 @@
 //! What a rollout records for one player, and its update learns from.
 
-use crate::learn::head::Head;
+use crate::head::Head;
 
 /// What one player saw, chose and earned. Time-major: index `t * slots + slot`.
 #[derive(Debug, Clone)]

@@ -10,12 +10,12 @@
 //!
 //! PLAYER is `protagonist` or `antagonist`; all f32. `outputs(x) = W2 tanh(W1 x + b1) + b2`.
 
-use crate::learn::arena::Arena;
-use crate::learn::head::Head;
-use crate::learn::network::{Network, Shape};
-use crate::learn::options::Role;
-use crate::learn::pair::Pair;
-use crate::learn::ppo::Player;
+use crate::arena::Arena;
+use crate::head::Head;
+use crate::network::{Network, Shape};
+use crate::pair::Pair;
+use crate::ppo::Player;
+use cvar_game::options::Role;
 use safetensors::tensor::{Dtype, SafeTensorError, SafeTensors, TensorView};
 use std::collections::{BTreeMap, HashMap};
 use tch::Device;
@@ -129,7 +129,7 @@ impl Place {
     }
 }
 
-/// All tensors of a player, out of the flat layout of [`crate::learn::network`].
+/// All tensors of a player, out of the flat layout of [`crate::network`].
 fn layout(role: Role, shape: Shape) -> Vec<(String, Place)> {
     let Shape { inputs, hidden, outputs, constants } = shape;
     let mut places = Vec::new();

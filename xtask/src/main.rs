@@ -69,20 +69,16 @@ fn run(verb: Verb) -> Result<ExitCode> {
     match verb {
         Verb::Setup => Ok(ExitCode::SUCCESS),
         Verb::Test { passed_on } => cargo(&repository, &["test", "--workspace"], &passed_on),
-        Verb::Bench { passed_on } => cargo(
-            &repository,
-            &[
-                "run",
-                "--release",
-                "--bin",
-                "cvar-game",
-                "--",
-                "bench",
-                "--config",
-                "configs/quick.toml",
-            ],
-            &passed_on,
-        ),
+        Verb::Bench { passed_on } => {
+            // `cargo run` alone would build one of the two programs.
+            let code = cargo(&repository, &["build", "--release", "--bins"], &[])?;
+            if code != ExitCode::SUCCESS {
+                return Ok(code);
+            }
+            let bench = ["--", "bench", "--config", "configs/quick.toml"];
+            let run = ["run", "--release", "--bin", "cvar-game"];
+            cargo(&repository, &[run, bench].concat(), &passed_on)
+        }
         Verb::Speed { passed_on } => {
             let target = speed::target(&repository);
             let start = SystemTime::now();

@@ -38,7 +38,7 @@ impl Row {
 
 /// What to run: the benchmarks of both crates.
 pub const CARGO: [&str; 9] =
-    ["bench", "-p", "cvar-game", "-p", "lava-envs", "--bench", "speed", "--bench", "stepping"];
+    ["bench", "-p", "cvar-learn", "-p", "lava-envs", "--bench", "speed", "--bench", "stepping"];
 
 /// Where cargo builds.
 pub fn target(repository: &Path) -> PathBuf {

@@ -126,7 +126,7 @@ fn describe(status: ExitStatus, log: &str, folder: &Path) -> String {
 
 /// The whole life of a worker process: carries out the run in `folder` and reports on standard
 /// output. Whether the run finished.
-pub fn work(folder: &Path) -> bool {
+pub fn work(folder: &Path, carry_out: CarryOut) -> bool {
     std::thread::spawn(|| {
         let _ = io::stdin().read_to_end(&mut Vec::new());
         // The parent is gone, and with it everyone who could use the result.
@@ -140,7 +140,7 @@ pub fn work(folder: &Path) -> bool {
     };
     let result = RunConfig::load(&folder.join("config.toml"))
         .map_err(|error| error.to_string())
-        .and_then(|run| execute(&run, folder, &mut |tick| report(&Report::Tick(tick))));
+        .and_then(|run| carry_out(&run, folder, &mut |tick| report(&Report::Tick(tick))));
     match result {
         Ok(()) => true,
         Err(failure) => {
@@ -150,24 +150,15 @@ pub fn work(folder: &Path) -> bool {
     }
 }
 
-/// Carries out the run in the calling thread.
-#[cfg(feature = "torch")]
-fn execute(run: &RunConfig, folder: &Path, tick: &mut dyn FnMut(Tick)) -> Result<(), String> {
-    crate::experiment::run::execute(run, folder, tick).map_err(|error| error.to_string())
-}
-
-#[cfg(not(feature = "torch"))]
-fn execute(_: &RunConfig, _: &Path, _: &mut dyn FnMut(Tick)) -> Result<(), String> {
-    Err("this build has no torch".to_owned())
-}
+/// How a run is carried out: trains and evaluates by the configuration, leaves the artefacts in the
+/// folder, and says in words why it failed.
+pub type CarryOut = fn(&RunConfig, &Path, &mut dyn FnMut(Tick)) -> Result<(), String>;
 
 /// Carries out runs in this process. Cannot be stopped: whoever uses it leaves signals to end the
 /// process.
-#[cfg(feature = "torch")]
 #[derive(Debug, Clone, Copy)]
-pub struct InProcess;
+pub struct InProcess(pub CarryOut);
 
-#[cfg(feature = "torch")]
 impl Launcher for InProcess {
     fn launch(
         &self,
@@ -176,6 +167,6 @@ impl Launcher for InProcess {
         _stop: &Stop,
         tick: &mut dyn FnMut(Tick),
     ) -> Result<(), Failure> {
-        execute(run, folder, tick).map_err(Failure::Failed)
+        (self.0)(run, folder, tick).map_err(Failure::Failed)
     }
 }

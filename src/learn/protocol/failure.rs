@@ -1,8 +1,8 @@
 //! Why a run failed, in the words that its user reads.
 
-use crate::exact::ExactError;
-use crate::learn::train::TrainError;
-use crate::learn::weights::WeightsError;
+use crate::train::TrainError;
+use crate::weights::WeightsError;
+use cvar_game::exact::ExactError;
 use std::io;
 use std::path::Path;
 
@@ -29,6 +29,9 @@ pub enum RunError {
         /// What the system says.
         source: io::Error,
     },
+    /// The output takes no more.
+    #[error("cannot write the steps: {0}")]
+    Output(io::Error),
     /// There is no such antagonist.
     #[error("{0}")]
     NoOpponent(&'static str),

@@ -1,6 +1,5 @@
 //! Whole runs through the program: the same bits from the same seed, and evaluations that agree with
 //! exact laws.
-#![cfg(feature = "torch")]
 
 use assert_cmd::Command;
 use cvar_game::experiment::artefacts::{Chance, Evaluation, Mode};
@@ -142,4 +141,59 @@ fn exact_laws_agree_with_played_episodes() {
 #[ignore = "a million episodes take minutes without optimisation"]
 fn exact_laws_agree_with_a_million_episodes() {
     exact_laws_agree_with(1_000_000);
+}
+
+/// The fields of a row by name, and the sums that its episode must obey.
+#[test]
+fn rollouts_are_the_episodes_of_the_evaluation_step_by_step() {
+    let folder = tempfile::tempdir().unwrap();
+    for env in ["lava-grid", "lava-point"] {
+        program()
+            .args(["train", "--env", env, "--eta", "25", "--seed", "1", "--steps", "40000"])
+            .args(["--set", "evaluation.episodes=300", "--out"])
+            .arg(folder.path())
+            .assert()
+            .success();
+        let run = folder.path().join(env).join("eta-25/seed-1");
+        let law = &evaluation(&run.join("evaluation.json"));
+        let law = &law.play(Mode::Greedy, Chance::Antagonist).unwrap().law;
+        let output = program()
+            .args(["rollout", "--antagonist", "learned", "--episodes", "300", "--run"])
+            .arg(&run)
+            .output()
+            .unwrap();
+        assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+        let mut reader = csv::Reader::from_reader(&output.stdout[..]);
+        let head = reader.headers().unwrap().clone();
+        let column = |name: &str| head.iter().position(|column| column == name).unwrap();
+        let [episode, t, delta, budget, reward, end] =
+            ["episode", "t", "delta", "budget", "reward", "end"].map(column);
+        let (mut episodes, mut time, mut eta, mut sum) = (0, 0, 25.0, 0.0);
+        for row in reader.records() {
+            let row = row.unwrap();
+            let number = |column: usize| row[column].parse::<f64>().unwrap();
+            assert_eq!((number(episode), number(t)), (f64::from(episodes), f64::from(time)));
+            let left = number(budget);
+            assert!((left / eta - 1.0).abs() < 1e-9, "budget {left}, expected {eta}");
+            assert!(number(delta) <= left * (1.0 + 1e-9), "delta exceeds the remaining budget");
+            eta = left / number(delta);
+            time += 1;
+            sum += number(reward);
+            if !row[end].is_empty() {
+                (episodes, time, eta) = (episodes + 1, 0, 25.0);
+            }
+        }
+        assert_eq!(episodes, 300);
+        assert!((sum / 300.0 - law.mean()).abs() < 1e-9, "{} against {}", sum / 300.0, law.mean());
+
+        let json = program()
+            .args(["rollout", "--episodes", "3", "--format", "json", "--run"])
+            .arg(&run)
+            .output()
+            .unwrap();
+        for line in String::from_utf8(json.stdout).unwrap().lines() {
+            let row: Value = serde_json::from_str(line).unwrap();
+            assert_eq!(row["delta"], 1.0, "nominal chance");
+        }
+    }
 }

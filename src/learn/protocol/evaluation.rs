@@ -5,18 +5,18 @@
 //! recorded episodes, on streams that all runs share. Three numbers are never conflated: the game
 //! value under the learned antagonist, the CVaR of the sampled policy, the CVaR of the greedy policy.
 
-use super::artefacts::{Audit, Certificate, Chance, Mode, Play};
-use super::config::{Device, RunConfig, WorldConfig};
 use super::failure::RunError;
-use crate::exact::antagonist::WorstCase;
-use crate::exact::grid::ExactGrid;
-use crate::exact::policy::Policy;
-use crate::learn::arena::Arena;
-use crate::learn::contest::{self, Choosing, Opponent};
-use crate::learn::head::CategoricalPolicy;
-use crate::learn::pair::Pair;
-use crate::learn::play::{self, Played};
-use crate::learn::weights;
+use crate::arena::Arena;
+use crate::contest::{self, Choosing, Opponent};
+use crate::head::CategoricalPolicy;
+use crate::pair::Pair;
+use crate::play::{self, Played, Watcher};
+use crate::weights;
+use cvar_game::exact::antagonist::WorstCase;
+use cvar_game::exact::grid::ExactGrid;
+use cvar_game::exact::policy::Policy;
+use cvar_game::experiment::artefacts::{Audit, Certificate, Chance, Mode, Play};
+use cvar_game::experiment::config::{Device, RunConfig, WorldConfig};
 use lava_envs::law::{FiniteLaw, MOVES, sample_index};
 use lava_envs::random::ChaCha8Rng;
 use lava_envs::{ConfigError, GridConfig, LavaGrid, LavaPoint, PointConfig, World};
@@ -44,14 +44,15 @@ pub trait Yardstick: Arena + Sized {
         plays: &mut [Play],
     ) -> Result<Option<Certificate>, RunError>;
 
-    /// Plays against the exact worst-case antagonist of the greedy protagonist.
+    /// Lets `play` meet the exact worst-case antagonist of the greedy protagonist.
     ///
     /// # Errors
-    /// If there is none for this world.
-    fn play_exact(
+    /// If there is none for this world, or `play` fails.
+    fn against_exact(
         constants: &Self::Constants,
         run: &RunConfig,
         pair: &Pair<Self>,
+        play: &mut dyn FnMut(&dyn Opponent<Self>) -> Result<Played, RunError>,
     ) -> Result<Played, RunError>;
 }
 
@@ -82,7 +83,7 @@ pub fn protocol<W: Yardstick>(
     let nominal = if antagonist { contest::Chance::Shadowed } else { contest::Chance::Nominal };
     let mut plays = Vec::new();
     let mut played = |mode, chance, kind| -> Result<Played, RunError> {
-        let episodes = play_episodes(run, constants, pair, mode, chance)?;
+        let episodes = play_episodes(run, constants, pair, mode, chance, &mut ())?;
         plays.push(to_play(mode, kind, &episodes));
         Ok(episodes)
     };
@@ -104,6 +105,7 @@ fn play_episodes<W: Yardstick>(
     pair: &Pair<W>,
     mode: Mode,
     chance: contest::Chance<'_, W>,
+    watcher: &mut impl Watcher<W>,
 ) -> Result<Played, RunError> {
     let slots = run.evaluation.parallel_episodes.min(run.evaluation.episodes as usize);
     let world = W::build(constants, slots)?;
@@ -119,7 +121,7 @@ fn play_episodes<W: Yardstick>(
         episodes: run.evaluation.episodes,
         seed: run.evaluation.seed,
     };
-    Ok(play::play(world, pair, &setting))
+    Ok(play::play(world, pair, &setting, watcher))
 }
 
 fn to_play(protagonist: Mode, chance: Chance, played: &Played) -> Play {
@@ -182,18 +184,26 @@ pub struct Request {
     pub seed: Option<u64>,
 }
 
+impl Request {
+    /// The configuration of the run in `folder`, changed as requested.
+    pub(super) fn load(&self, folder: &Path) -> Result<RunConfig, RunError> {
+        tch::set_num_threads(1);
+        let mut run = RunConfig::load(&folder.join("config.toml")).map_err(|error| {
+            RunError::file(&folder.join("config.toml"))(std::io::Error::other(error))
+        })?;
+        run.evaluation.episodes = self.episodes.unwrap_or(run.evaluation.episodes);
+        run.evaluation.seed = self.seed.unwrap_or(run.evaluation.seed);
+        Ok(run)
+    }
+}
+
 /// Plays the greedy and the sampled protagonist of the finished run in `folder`; against the exact
 /// antagonist, which is that of the greedy protagonist, this one alone. Writes nothing.
 ///
 /// # Errors
 /// If the folder holds no finished run or the request makes no sense for it.
 pub fn evaluate_run(folder: &Path, request: &Request) -> Result<Vec<Play>, RunError> {
-    tch::set_num_threads(1);
-    let mut run = RunConfig::load(&folder.join("config.toml")).map_err(|error| {
-        RunError::file(&folder.join("config.toml"))(std::io::Error::other(error))
-    })?;
-    run.evaluation.episodes = request.episodes.unwrap_or(run.evaluation.episodes);
-    run.evaluation.seed = request.seed.unwrap_or(run.evaluation.seed);
+    let run = request.load(folder)?;
     match &run.env {
         WorldConfig::LavaGrid(constants) => {
             answer::<LavaGrid>(&run, constants, folder, request.chance)
@@ -211,29 +221,55 @@ fn answer<W: Yardstick>(
     chance: Chance,
 ) -> Result<Vec<Play>, RunError> {
     let pair = load::<W>(run, folder)?;
-    if chance == Chance::Exact {
-        let played = W::play_exact(constants, run, &pair)?;
-        return Ok(vec![to_play(Mode::Greedy, chance, &played)]);
-    }
-    if chance == Chance::Antagonist && pair.antagonist.is_none() {
-        return Err(RunError::NoOpponent(
-            "a run at eta = 1 has no learned antagonist; use --antagonist nominal",
-        ));
-    }
-    [Mode::Greedy, Mode::Sampled]
-        .into_iter()
-        .map(|mode| {
-            let kind = match chance {
-                Chance::Antagonist => contest::Chance::Antagonist,
-                Chance::Nominal | Chance::Exact => contest::Chance::Nominal,
-            };
-            Ok(to_play(mode, chance, &play_episodes(run, constants, &pair, mode, kind)?))
-        })
-        .collect()
+    let modes: &[Mode] = match chance {
+        Chance::Exact => &[Mode::Greedy],
+        Chance::Nominal | Chance::Antagonist => &[Mode::Greedy, Mode::Sampled],
+    };
+    let play = |&mode| {
+        let played = play_run(run, constants, &pair, mode, chance, &mut ())?;
+        Ok(to_play(mode, chance, &played))
+    };
+    modes.iter().map(play).collect()
+}
+
+/// Plays the episodes of the run's configuration with its pair.
+///
+/// # Errors
+/// If the run has no such antagonist.
+pub(super) fn play_run<W: Yardstick>(
+    run: &RunConfig,
+    constants: &W::Constants,
+    pair: &Pair<W>,
+    mode: Mode,
+    chance: Chance,
+    watcher: &mut impl Watcher<W>,
+) -> Result<Played, RunError> {
+    let chance = match chance {
+        Chance::Nominal => contest::Chance::Nominal,
+        Chance::Antagonist if pair.antagonist.is_some() => contest::Chance::Antagonist,
+        Chance::Antagonist => {
+            return Err(RunError::NoOpponent(
+                "a run at eta = 1 has no learned antagonist; use --antagonist nominal",
+            ));
+        }
+        Chance::Exact if mode == Mode::Greedy => {
+            return W::against_exact(constants, run, pair, &mut |opponent| {
+                let chance = contest::Chance::Opponent(opponent);
+                play_episodes(run, constants, pair, mode, chance, watcher)
+            });
+        }
+        Chance::Exact => {
+            return Err(RunError::NoOpponent(
+                "the exact worst-case antagonist is that of the greedy protagonist; \
+                 use --protagonist greedy",
+            ));
+        }
+    };
+    play_episodes(run, constants, pair, mode, chance, watcher)
 }
 
 /// The trained pair of a finished run.
-fn load<W: Arena>(run: &RunConfig, folder: &Path) -> Result<Pair<W>, RunError> {
+pub(super) fn load<W: Arena>(run: &RunConfig, folder: &Path) -> Result<Pair<W>, RunError> {
     let path = folder.join("final.safetensors");
     let bytes = std::fs::read(&path).map_err(RunError::file(&path))?;
     let device = device(run.device);
@@ -287,19 +323,16 @@ impl Yardstick for LavaGrid {
         }))
     }
 
-    fn play_exact(
+    fn against_exact(
         constants: &GridConfig,
         run: &RunConfig,
         pair: &Pair<Self>,
+        play: &mut dyn FnMut(&dyn Opponent<Self>) -> Result<Played, RunError>,
     ) -> Result<Played, RunError> {
         let exact = ExactGrid::new(constants, run.gamma)?;
         let greedy = policy_of(&exact, constants, pair)?.greedy(exact.mdp());
-        let worst = ExactOpponent {
-            exact: &exact,
-            greedy: &greedy,
-            worst: exact.worst_case(&greedy, run.eta.get())?,
-        };
-        play_episodes(run, constants, pair, Mode::Greedy, contest::Chance::Opponent(&worst))
+        let worst = exact.worst_case(&greedy, run.eta.get())?;
+        play(&ExactOpponent { exact: &exact, greedy: &greedy, worst })
     }
 }
 
@@ -377,7 +410,12 @@ impl Yardstick for LavaPoint {
         Ok(None)
     }
 
-    fn play_exact(_: &PointConfig, _: &RunConfig, _: &Pair<Self>) -> Result<Played, RunError> {
+    fn against_exact(
+        _: &PointConfig,
+        _: &RunConfig,
+        _: &Pair<Self>,
+        _: &mut dyn FnMut(&dyn Opponent<Self>) -> Result<Played, RunError>,
+    ) -> Result<Played, RunError> {
         Err(RunError::NoOpponent(
             "the exact worst-case antagonist is known on lava-grid alone; \
              use --antagonist learned or nominal",

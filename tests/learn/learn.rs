@@ -5,16 +5,16 @@
 use cvar_game::game::budget::{Budget, Eta};
 use cvar_game::game::finite::FiniteFamily;
 use cvar_game::game::gaussian::GaussianFamily;
-use cvar_game::learn::arena::Arena;
-use cvar_game::learn::contest::{Chance, Choosing};
-use cvar_game::learn::head::{AntagonistHead, CategoricalPolicy, GaussianPolicy, Head};
-use cvar_game::learn::network::{Network, Shape};
-use cvar_game::learn::options::{BumpBounds, Credit, PlayerOptions, Role, TrainOptions};
-use cvar_game::learn::pair::Pair;
-use cvar_game::learn::play::{Play, play};
-use cvar_game::learn::ppo::{Sample, loss};
-use cvar_game::learn::train::{Game, schedule, train};
-use cvar_game::learn::weights;
+use cvar_game::options::{BumpBounds, Credit, PlayerOptions, Role, TrainOptions};
+use cvar_learn::arena::Arena;
+use cvar_learn::contest::{Chance, Choosing};
+use cvar_learn::head::{AntagonistHead, CategoricalPolicy, GaussianPolicy, Head};
+use cvar_learn::network::{Network, Shape};
+use cvar_learn::pair::Pair;
+use cvar_learn::play::{Play, play};
+use cvar_learn::ppo::{Sample, loss};
+use cvar_learn::train::{Game, schedule, train};
+use cvar_learn::weights;
 use lava_envs::law::{FiniteLaw, GaussianLaw, Law};
 use lava_envs::{End, Force, GridConfig, LavaGrid, LavaPoint, Move, PointConfig, Step, World};
 use nalgebra::Vector2;
@@ -248,7 +248,7 @@ fn check_budget<W: Arena>(world: impl Fn() -> W) {
                 episodes: episodes / 4,
                 seed,
             };
-            let played = play(world(), &pair, &setting);
+            let played = play(world(), &pair, &setting, &mut ());
             for episode in &played.episodes {
                 let used = episode.likelihood_ratio / budget;
                 assert!(used <= 1.0 + 1e-6, "prod delta / eta = {used} at strength {strength}");
@@ -281,7 +281,7 @@ fn check_weights<W: Arena>(world: impl Fn() -> W) {
             episodes: 6_000,
             seed: 9,
         };
-        let values: Vec<f64> = play(world(), &pair, &setting)
+        let values: Vec<f64> = play(world(), &pair, &setting, &mut ())
             .episodes
             .iter()
             .map(|e| (e.likelihood_ratio, e.atom.value))
@@ -320,7 +320,9 @@ fn at_budget_one_delta_is_one() {
         seed: 1,
     };
     let world = LavaPoint::new(&PointConfig::default(), 50).unwrap();
-    assert!(play(world, &pair, &setting).episodes.iter().all(|e| e.likelihood_ratio == 1.0));
+    assert!(
+        play(world, &pair, &setting, &mut ()).episodes.iter().all(|e| e.likelihood_ratio == 1.0)
+    );
 }
 
 /// An episode is what it is, however many are played at once.
@@ -336,7 +338,7 @@ fn episodes_do_not_depend_on_the_batch() {
             episodes: 300,
             seed: 2,
         };
-        play(LavaPoint::new(&PointConfig::default(), slots).unwrap(), &pair, &setting)
+        play(LavaPoint::new(&PointConfig::default(), slots).unwrap(), &pair, &setting, &mut ())
             .episodes
             .iter()
             .map(|e| (e.atom.steps, e.atom.end))
@@ -508,7 +510,7 @@ fn the_pair_learns_a_two_step_game_to_its_value() {
             episodes: 20_000,
             seed: 1,
         };
-        let value = play(world(), &pair, &setting).law().mean();
+        let value = play(world(), &pair, &setting, &mut ()).law().mean();
         // Around its optimum the antagonist's value has a kink, on which it goes back and forth; the
         // next best plan, all budget on the first coin, is worth 0.15.
         assert!((value - known).abs() < 0.15, "eta = {budget}: value {value}, known {known}");

@@ -1,12 +1,12 @@
 //! One run, from its configuration to its artefacts: train, keep the weights, evaluate.
 
-use super::artefacts::{Evaluation, Manifest, SCHEMA, write_in_place};
-use super::config::{RunConfig, WorldConfig};
 use super::evaluation::{self, Yardstick};
 use super::failure::RunError;
-use super::runner::Tick;
-use crate::learn::train::{Game, Progress, train};
-use crate::learn::weights;
+use crate::train::{Game, Progress, train};
+use crate::weights;
+use cvar_game::experiment::artefacts::{Evaluation, Manifest, SCHEMA, write_in_place};
+use cvar_game::experiment::config::{RunConfig, WorldConfig};
+use cvar_game::experiment::runner::Tick;
 use lava_envs::{LavaGrid, LavaPoint};
 use std::fs::File;
 use std::io::{self, BufWriter, Write};

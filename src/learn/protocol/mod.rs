@@ -1,0 +1,13 @@
+//! The life of a run behind its configuration: train, keep the weights, judge, and show step by step.
+//!
+//! | question | module |
+//! |---|---|
+//! | what happens in a run | [`run`] |
+//! | how is a trained pair judged | [`evaluation`] |
+//! | how are its steps written out | [`steps`] |
+//! | why does a run fail | [`failure`] |
+
+pub mod evaluation;
+pub mod failure;
+pub mod run;
+pub mod steps;
