@@ -70,10 +70,16 @@ pub struct CategoricalPolicy;
 impl CategoricalPolicy {
     /// Probabilities of the moves, from logits.
     pub fn probabilities(logits: &[f64]) -> [f64; MOVES] {
-        let highest = logits.iter().copied().fold(f64::NEG_INFINITY, f64::max);
+        Self::softmax(logits).0
+    }
+
+    /// Probabilities and log-probabilities of the moves.
+    fn softmax(logits: &[f64]) -> ([f64; MOVES], [f64; MOVES]) {
+        let highest = logits[..MOVES].iter().copied().fold(f64::NEG_INFINITY, f64::max);
         let weights: [f64; MOVES] = std::array::from_fn(|i| (logits[i] - highest).exp());
         let sum: f64 = weights.iter().sum();
-        weights.map(|weight| weight / sum)
+        let shift = highest + sum.ln();
+        (weights.map(|weight| weight / sum), std::array::from_fn(|i| logits[i] - shift))
     }
 }
 
@@ -86,7 +92,7 @@ impl Head for CategoricalPolicy {
     }
 
     fn log_probability(&self, parameters: &[f64], _: &(), choice: &Move) -> f64 {
-        Self::probabilities(parameters)[choice.index()].ln()
+        Self::softmax(parameters).1[choice.index()]
     }
 
     fn gradients(
@@ -97,8 +103,7 @@ impl Head for CategoricalPolicy {
         score: &mut [f64],
         entropy_gradient: &mut [f64],
     ) -> (f64, f64) {
-        let probabilities = Self::probabilities(parameters);
-        let logs = probabilities.map(|p| p.max(f64::MIN_POSITIVE).ln());
+        let (probabilities, logs) = Self::softmax(parameters);
         let entropy: f64 = -(0..MOVES).map(|i| probabilities[i] * logs[i]).sum::<f64>();
         for i in 0..MOVES {
             score[i] = f64::from(i == choice.index()) - probabilities[i];

@@ -18,14 +18,18 @@
 //! All parameters live in one flat vector `[W' | V | b | c]`, where c are the constants of the
 //! actor's head that no observation moves (the log standard deviations of a Gaussian policy).
 //!
-//! Columns per sample rather than rows, and W transposed, because the matrix library is five times
-//! faster with `[5, 128] [128, n]` than with `[n, 128] [128, 5]`, and with `x (dL/dh)'` than with
-//! `dL/dh x'`.
+//! The passes are carried out by [`fused`] on the processor and by [`tensors`], which is libtorch, on
+//! other devices; a test holds the two, and libtorch's own derivatives, together.
 
+mod fused;
+mod tensors;
+
+use fused::Fused;
 use nalgebra::DMatrix;
 use rand::{Rng, RngExt};
 use rand_distr::StandardNormal;
-use tch::{Device, Kind, Tensor};
+use tch::Device;
+use tensors::Tensors;
 
 /// Sizes of a player's networks.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -79,6 +83,11 @@ impl Shape {
         self.first() + row * 2 * self.hidden + unit
     }
 
+    /// The hidden units that a row of y is made of: the actor's, or the critic's for the last row.
+    fn half(&self, row: usize) -> std::ops::Range<usize> {
+        if row < self.outputs { 0..self.hidden } else { self.hidden..2 * self.hidden }
+    }
+
     /// Number of parameters.
     pub fn parameters(&self) -> usize {
         self.constants_at() + self.constants
@@ -89,27 +98,28 @@ impl Shape {
 #[derive(Debug)]
 pub struct Network {
     shape: Shape,
-    /// The parameters as the optimiser sees them.
     parameters: Vec<f32>,
-    /// The same on the device, with W and V as views of it.
-    flat: Tensor,
-    first: Tensor,
-    second: Tensor,
-    /// Gradient on the device, with views likewise.
-    gradient: Tensor,
-    first_gradient: Tensor,
-    second_gradient: Tensor,
-    buffers: Option<Buffers>,
-    device: Device,
+    engine: Engine,
 }
 
-/// Tensors reused from batch to batch of one size.
+/// Who carries the passes out.
 #[derive(Debug)]
-struct Buffers {
-    samples: i64,
-    hidden: Tensor,
-    outputs: Tensor,
-    hidden_gradient: Tensor,
+enum Engine {
+    Processor(Fused),
+    Device(Tensors),
+}
+
+/// Samples of a batch whose outputs are known and whose loss is asked for.
+#[derive(Debug)]
+pub struct Outputs<'a> {
+    /// Index of the first of them in the batch.
+    pub start: usize,
+    /// Number of them.
+    pub samples: usize,
+    /// Outputs y, to be turned into dL/dy: `y[row * stride + sample]`.
+    pub y: &'a mut [f32],
+    /// Numbers between two rows, at least `samples`.
+    pub stride: usize,
 }
 
 impl Network {
@@ -141,33 +151,22 @@ impl Network {
 
     /// A network with these parameters.
     pub fn from_parameters(shape: Shape, parameters: Vec<f32>, device: Device) -> Self {
+        let engine = match device {
+            Device::Cpu => Engine::Processor(Fused::default()),
+            device => Engine::Device(Tensors::new(shape, &parameters, device)),
+        };
+        Self::with_engine(shape, parameters, engine)
+    }
+
+    /// A network with these parameters that libtorch carries out, on the processor as well.
+    pub fn by_libtorch(shape: Shape, parameters: Vec<f32>, device: Device) -> Self {
+        let engine = Engine::Device(Tensors::new(shape, &parameters, device));
+        Self::with_engine(shape, parameters, engine)
+    }
+
+    fn with_engine(shape: Shape, parameters: Vec<f32>, engine: Engine) -> Self {
         assert_eq!(parameters.len(), shape.parameters(), "parameters of the network");
-        let flat = Tensor::zeros(shape.parameters() as i64, (Kind::Float, device));
-        let gradient = flat.zeros_like();
-        let view = |tensor: &Tensor| {
-            let (first, second) = (shape.first() as i64, shape.second() as i64);
-            let wide = 2 * shape.hidden as i64;
-            (
-                tensor.narrow(0, 0, first).view([shape.width() as i64, wide]).tr(),
-                tensor.narrow(0, first, second).view([shape.rows() as i64, wide]),
-            )
-        };
-        let (first, second) = view(&flat);
-        let (first_gradient, second_gradient) = view(&gradient);
-        let mut network = Network {
-            shape,
-            parameters,
-            flat,
-            first,
-            second,
-            gradient,
-            first_gradient,
-            second_gradient,
-            buffers: None,
-            device,
-        };
-        network.upload();
-        network
+        Network { shape, parameters, engine }
     }
 
     /// Sizes of the network.
@@ -183,11 +182,9 @@ impl Network {
     /// Changes the parameters.
     pub fn change(&mut self, change: impl FnOnce(&mut [f32])) {
         change(&mut self.parameters);
-        self.upload();
-    }
-
-    fn upload(&mut self) {
-        self.flat.copy_(&Tensor::from_slice(&self.parameters));
+        if let Engine::Device(tensors) = &mut self.engine {
+            tensors.upload(&self.parameters);
+        }
     }
 
     /// Constants c of the actor's head.
@@ -198,102 +195,47 @@ impl Network {
     /// Outputs of the actor alone, shape `[k, n]`; `inputs` holds n samples one after the other,
     /// shape `[n, inputs + 1]`.
     pub fn act(&self, inputs: &[f32], outputs: &mut Vec<f32>) {
-        let (hidden, k) = (self.shape.hidden as i64, self.shape.outputs as i64);
-        let h = tanh_(self.first.narrow(0, 0, hidden).mm(&self.columns(inputs)));
-        let y = self.second.narrow(0, 0, k).narrow(1, 0, hidden).mm(&h);
-        download(&y, outputs);
-        let bias = self.shape.bias_at();
-        add_bias(outputs, &self.parameters[bias..bias + k as usize]);
+        self.evaluate(inputs, false, outputs);
     }
 
     /// Values of the critic alone, shape `[n]`, for inputs as in [`Network::act`].
     pub fn values(&self, inputs: &[f32], values: &mut Vec<f32>) {
-        let (hidden, k) = (self.shape.hidden as i64, self.shape.outputs as i64);
-        let h = tanh_(self.first.narrow(0, hidden, hidden).mm(&self.columns(inputs)));
-        download(&self.second.narrow(0, k, 1).narrow(1, hidden, hidden).mm(&h), values);
-        let bias = self.shape.bias_at() + self.shape.outputs;
-        add_bias(values, &self.parameters[bias..=bias]);
+        self.evaluate(inputs, true, values);
+    }
+
+    fn evaluate(&self, inputs: &[f32], critic: bool, outputs: &mut Vec<f32>) {
+        let (shape, parameters) = (self.shape, &self.parameters);
+        match &self.engine {
+            Engine::Processor(_) => {
+                fused::Evaluate { shape, parameters, inputs, critic, outputs }.run();
+            }
+            Engine::Device(tensors) => {
+                tensors.evaluate(inputs, critic, outputs);
+                let bias = shape.bias_at() + if critic { shape.outputs } else { 0 };
+                let rows = if critic { 1 } else { shape.outputs };
+                add_bias(outputs, &parameters[bias..bias + rows]);
+            }
+        }
     }
 
     /// Outputs and gradient in one: evaluates y on a batch of inputs as in [`Network::act`], lets
-    /// `loss` turn it (shape `[k + 1, n]`, in place) into dL/dy and write dL/dc, given c, and writes
-    /// dL/d parameters.
-    pub fn differentiate<R>(
+    /// `loss` turn it into dL/dy block by block, and writes dL/d parameters, except for those of the
+    /// constants c, which are left zero.
+    pub fn differentiate(
         &mut self,
         inputs: &[f32],
         gradient: &mut Vec<f32>,
-        loss: impl FnOnce(&mut [f32], &[f32], &mut [f32]) -> R,
-    ) -> R {
-        let shape = self.shape;
-        let x = self.columns(inputs).contiguous();
-        let samples = x.size()[1];
-        let buffers = Buffers::of(&mut self.buffers, samples, shape, self.device);
-        let _ = self.first.mm_out(&buffers.hidden, &x);
-        let h = tanh_(buffers.hidden.shallow_clone());
-        let _ = self.second.mm_out(&buffers.outputs, &h);
-
-        let mut y = Vec::new();
-        download(&buffers.outputs, &mut y);
-        let (bias, constants_at) = (shape.bias_at(), shape.constants_at());
-        add_bias(&mut y, &self.parameters[bias..constants_at]);
-        let mut by_constants = vec![0.0; shape.constants];
-        let result = loss(&mut y, &self.parameters[constants_at..], &mut by_constants);
-
-        let by_y = Tensor::from_slice(&y).view([-1, samples]).to_device(self.device);
-        let _ = by_y.mm_out(&self.second_gradient, &h.tr());
-        let by_h = &buffers.hidden_gradient;
-        let _ = self.second.tr().mm_out(by_h, &by_y);
-        let _ = Tensor::tanh_backward_grad_input(by_h, by_h, &h);
-        let _ = x.mm_out(&self.first_gradient.tr(), &by_h.tr());
-
-        download(&self.gradient, gradient);
-        let hidden = shape.hidden;
-        for row in 0..shape.outputs {
-            gradient[shape.second_at(row, hidden)..shape.second_at(row, 2 * hidden)].fill(0.0);
+        loss: impl FnMut(Outputs<'_>),
+    ) {
+        let (shape, parameters) = (self.shape, &self.parameters[..]);
+        gradient.resize(shape.parameters(), 0.0);
+        match &mut self.engine {
+            Engine::Processor(buffers) => {
+                fused::Differentiate { shape, parameters, inputs, gradient, loss, buffers }.run();
+            }
+            Engine::Device(tensors) => tensors.differentiate(parameters, inputs, gradient, loss),
         }
-        let value = shape.outputs;
-        gradient[shape.second_at(value, 0)..shape.second_at(value, hidden)].fill(0.0);
-        for (sum, row) in gradient[bias..].iter_mut().zip(y.chunks_exact(samples as usize)) {
-            *sum = row.iter().map(|&by| f64::from(by)).sum::<f64>() as f32;
-        }
-        gradient[constants_at..].copy_from_slice(&by_constants);
-        result
     }
-
-    /// x, a column per sample.
-    fn columns(&self, inputs: &[f32]) -> Tensor {
-        Tensor::from_slice(inputs).view([-1, self.shape.width() as i64]).to_device(self.device).tr()
-    }
-}
-
-impl Buffers {
-    fn of(slot: &mut Option<Buffers>, samples: i64, shape: Shape, device: Device) -> &mut Buffers {
-        if slot.as_ref().is_none_or(|buffers| buffers.samples != samples) {
-            let zeros = |rows: usize| Tensor::zeros([rows as i64, samples], (Kind::Float, device));
-            *slot = Some(Buffers {
-                samples,
-                hidden: zeros(2 * shape.hidden),
-                outputs: zeros(shape.rows()),
-                hidden_gradient: zeros(2 * shape.hidden),
-            });
-        }
-        slot.as_mut().expect("filled above")
-    }
-}
-
-/// tanh(z) = 2 sigmoid(2z) - 1, in place: libtorch's sigmoid is vectorised everywhere, its tanh goes
-/// to a library that is six times slower on some processors. A test holds it to 1e-5.
-fn tanh_(mut z: Tensor) -> Tensor {
-    let _ = z.g_mul_scalar_(2.0);
-    let _ = z.sigmoid_();
-    let _ = z.g_mul_scalar_(2.0);
-    let _ = z.g_sub_scalar_(1.0);
-    z
-}
-
-fn download(tensor: &Tensor, values: &mut Vec<f32>) {
-    values.resize(tensor.numel(), 0.0);
-    tensor.copy_data(values, tensor.numel());
 }
 
 fn add_bias(outputs: &mut [f32], bias: &[f32]) {

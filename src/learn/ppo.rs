@@ -7,13 +7,13 @@
 //! -min(r A, clip(r, 1 - eps, 1 + eps) A) - c_entropy H + c_value (V - R)^2,    R = A_gae + V_old.
 //! ```
 //!
-//! Its gradient by the outputs of actor and critic is written out in [`loss`]; the networks carry it
+//! Its gradient by the outputs of actor and critic is written out in [`Loss`]; the networks carry it
 //! to the parameters.
 
 use crate::adam::Adam;
 use crate::gae;
 use crate::head::{Head, MAX_PARAMETERS};
-use crate::network::{Network, Shape};
+use crate::network::{Network, Outputs, Shape};
 use crate::trajectories::Trajectories;
 use cvar_game::options::PlayerOptions;
 use lava_envs::random::ChaCha8Rng;
@@ -178,11 +178,11 @@ impl<H: Head> Player<H> {
                     inputs.extend_from_slice(&trajectories.inputs[i * row..(i + 1) * row]);
                     batch.push(samples[i].clone());
                 }
-                let head = &self.head;
-                let mut step =
-                    self.network.differentiate(&inputs, &mut gradient, |y, constants, by_c| {
-                        loss(head, &batch, options, rates.entropy, y, constants, by_c)
-                    });
+                let constants = self.network.constants().to_vec();
+                let mut loss = Loss::new(&self.head, &batch, options, rates.entropy, &constants);
+                self.network.differentiate(&inputs, &mut gradient, |block| loss.add(block));
+                let at = gradient.len() - constants.len();
+                let mut step = loss.finish(&mut gradient[at..]);
                 step.gradient_norm = clip_norm(&mut gradient, options.gradient_norm);
                 losses.add(&step, weight);
                 let optimiser = &mut self.optimiser;
@@ -195,78 +195,118 @@ impl<H: Head> Player<H> {
     }
 }
 
-/// The loss of a minibatch and its gradient.
-///
-/// `y`, shape `[k + 1, n]`, holds the actor's outputs and below them the values, and is overwritten by
-/// the gradient; `by_constants` receives the gradient by the head's constants.
-pub fn loss<H: Head>(
-    head: &H,
-    samples: &[Sample<H>],
-    options: &PlayerOptions,
+/// The loss of a minibatch and its gradient by the outputs of the network, block by block.
+pub struct Loss<'a, H: Head> {
+    head: &'a H,
+    samples: &'a [Sample<H>],
+    options: &'a PlayerOptions,
     entropy_weight: f64,
-    y: &mut [f32],
-    constants: &[f32],
-    by_constants: &mut [f32],
-) -> Losses {
-    let share = 1.0 / samples.len() as f64;
-    let mean = samples.iter().map(|s| f64::from(s.advantage)).sum::<f64>() * share;
-    let variance = samples.iter().map(|s| (f64::from(s.advantage) - mean).powi(2)).sum::<f64>()
-        / (samples.len() as f64 - 1.0).max(1.0);
-    let scale = 1.0 / (variance.sqrt() + 1e-8);
+    /// Of the minibatch's advantages.
+    mean: f64,
+    /// 1 over their standard deviation.
+    scale: f64,
+    /// Number of the head's parameters.
+    count: usize,
+    /// Them; the constants are in place.
+    parameters: [f64; MAX_PARAMETERS],
+    by_constants: [f64; MAX_PARAMETERS],
+    losses: Losses,
+}
 
-    let outputs = head.outputs();
-    let count = outputs + constants.len();
-    let mut parameters = [0.0; MAX_PARAMETERS];
-    for (parameter, &constant) in parameters[outputs..].iter_mut().zip(constants) {
-        *parameter = f64::from(constant);
-    }
-    let mut score = [0.0; MAX_PARAMETERS];
-    let mut by_entropy = [0.0; MAX_PARAMETERS];
-    let mut constants_gradient = [0.0; MAX_PARAMETERS];
-    let mut losses = Losses::default();
-    let n = samples.len();
-    for (column, sample) in samples.iter().enumerate() {
-        for i in 0..outputs {
-            parameters[i] = f64::from(y[i * n + column]);
+impl<'a, H: Head> Loss<'a, H> {
+    /// The loss of these samples, with the head's constants.
+    pub fn new(
+        head: &'a H,
+        samples: &'a [Sample<H>],
+        options: &'a PlayerOptions,
+        entropy_weight: f64,
+        constants: &[f32],
+    ) -> Self {
+        let number = samples.len() as f64;
+        let mean = samples.iter().map(|s| f64::from(s.advantage)).sum::<f64>() / number;
+        let variance = samples.iter().map(|s| (f64::from(s.advantage) - mean).powi(2)).sum::<f64>()
+            / (number - 1.0).max(1.0);
+        let scale = 1.0 / (variance.sqrt() + 1e-8);
+        let mut parameters = [0.0; MAX_PARAMETERS];
+        for (parameter, &constant) in parameters[head.outputs()..].iter_mut().zip(constants) {
+            *parameter = f64::from(constant);
         }
-        let value = &mut y[outputs * n + column];
-        let (log_probability, entropy) = head.gradients(
-            &parameters[..count],
-            &sample.given,
-            &sample.choice,
-            &mut score[..count],
-            &mut by_entropy[..count],
-        );
-        let log_ratio = log_probability - sample.log_probability;
-        let ratio = log_ratio.exp();
-        let advantage = (f64::from(sample.advantage) - mean) * scale;
-        let clipped = ratio.clamp(1.0 - options.clip, 1.0 + options.clip);
-        let surrogate = (ratio * advantage).min(clipped * advantage);
-        // Where the clipped branch is the smaller one it is constant in the parameters.
-        let by_log_probability =
-            if ratio * advantage <= clipped * advantage { -share * ratio * advantage } else { 0.0 };
-        let error = f64::from(*value) - f64::from(sample.target);
-        *value = (2.0 * options.value_coefficient * share * error) as f32;
-
-        losses.policy_loss -= share * surrogate;
-        losses.value_loss += share * error * error;
-        losses.entropy += share * entropy;
-        losses.approx_kl += share * (ratio - 1.0 - log_ratio);
-        losses.clip_fraction += share * f64::from(u8::from(ratio != clipped));
-
-        let gradient =
-            |i: usize| by_log_probability * score[i] - share * entropy_weight * by_entropy[i];
-        for i in 0..outputs {
-            y[i * n + column] = gradient(i) as f32;
-        }
-        for (i, sum) in constants_gradient[..constants.len()].iter_mut().enumerate() {
-            *sum += gradient(outputs + i);
+        let count = head.outputs() + constants.len();
+        let (by_constants, losses) = ([0.0; MAX_PARAMETERS], Losses::default());
+        Loss {
+            head,
+            samples,
+            options,
+            entropy_weight,
+            mean,
+            scale,
+            count,
+            parameters,
+            by_constants,
+            losses,
         }
     }
-    for (slot, value) in by_constants.iter_mut().zip(constants_gradient) {
-        *slot = value as f32;
+
+    /// Adds the samples of a block, whose y holds the actor's outputs and below them the values.
+    pub fn add(&mut self, block: Outputs<'_>) {
+        let Outputs { start, samples, y, stride } = block;
+        let options = self.options;
+        let share = 1.0 / self.samples.len() as f64;
+        let outputs = self.head.outputs();
+        let (mut score, mut by_entropy) = ([0.0; MAX_PARAMETERS], [0.0; MAX_PARAMETERS]);
+        let losses = &mut self.losses;
+        for (column, sample) in self.samples[start..start + samples].iter().enumerate() {
+            for (i, parameter) in self.parameters[..outputs].iter_mut().enumerate() {
+                *parameter = f64::from(y[i * stride + column]);
+            }
+            let (log_probability, entropy) = self.head.gradients(
+                &self.parameters[..self.count],
+                &sample.given,
+                &sample.choice,
+                &mut score[..self.count],
+                &mut by_entropy[..self.count],
+            );
+            let log_ratio = log_probability - sample.log_probability;
+            let ratio = log_ratio.exp();
+            let advantage = (f64::from(sample.advantage) - self.mean) * self.scale;
+            let clipped = ratio.clamp(1.0 - options.clip, 1.0 + options.clip);
+            let surrogate = (ratio * advantage).min(clipped * advantage);
+            // Where the clipped branch is the smaller one it is constant in the parameters.
+            let by_log_probability = if ratio * advantage <= clipped * advantage {
+                -share * ratio * advantage
+            } else {
+                0.0
+            };
+            let value = &mut y[outputs * stride + column];
+            let error = f64::from(*value) - f64::from(sample.target);
+            *value = (2.0 * options.value_coefficient * share * error) as f32;
+
+            losses.policy_loss -= share * surrogate;
+            losses.value_loss += share * error * error;
+            losses.entropy += share * entropy;
+            losses.approx_kl += share * (ratio - 1.0 - log_ratio);
+            losses.clip_fraction += share * f64::from(u8::from(ratio != clipped));
+
+            let entropy_weight = share * self.entropy_weight;
+            let gradient =
+                |i: usize| by_log_probability * score[i] - entropy_weight * by_entropy[i];
+            for i in 0..outputs {
+                y[i * stride + column] = gradient(i) as f32;
+            }
+            for (i, sum) in self.by_constants[outputs..self.count].iter_mut().enumerate() {
+                *sum += gradient(outputs + i);
+            }
+        }
     }
-    losses
+
+    /// Writes the gradient by the head's constants and answers with the losses.
+    pub fn finish(self, by_constants: &mut [f32]) -> Losses {
+        for (slot, value) in by_constants.iter_mut().zip(&self.by_constants[self.head.outputs()..])
+        {
+            *slot = *value as f32;
+        }
+        self.losses
+    }
 }
 
 /// Scales the gradient down to `limit` if it is longer; returns its norm before.

@@ -9,10 +9,10 @@ use cvar_game::options::{BumpBounds, Credit, PlayerOptions, Role, TrainOptions};
 use cvar_learn::arena::Arena;
 use cvar_learn::contest::{Chance, Choosing};
 use cvar_learn::head::{AntagonistHead, CategoricalPolicy, GaussianPolicy, Head};
-use cvar_learn::network::{Network, Shape};
+use cvar_learn::network::{Network, Outputs, Shape};
 use cvar_learn::pair::Pair;
 use cvar_learn::play::{Play, play};
-use cvar_learn::ppo::{Sample, loss};
+use cvar_learn::ppo::{Loss, Sample};
 use cvar_learn::train::{Game, schedule, train};
 use cvar_learn::weights;
 use lava_envs::law::{FiniteLaw, GaussianLaw, Law};
@@ -73,7 +73,10 @@ fn check_loss_gradient<H: Head>(head: &H, samples: &[Sample<H>], constants: &[f3
     let y: Vec<f32> = (0..rows * samples.len()).map(|_| random.random_range(-0.8..0.8)).collect();
     let evaluate = |y: &[f32], constants: &[f32]| {
         let (mut y, mut by_c) = (y.to_vec(), vec![0.0; constants.len()]);
-        let of = loss(head, samples, &options, 0.01, &mut y, constants, &mut by_c);
+        let mut loss = Loss::new(head, samples, &options, 0.01, constants);
+        let stride = samples.len();
+        loss.add(Outputs { start: 0, samples: stride, y: &mut y, stride });
+        let of = loss.finish(&mut by_c);
         let total = of.policy_loss - 0.01 * of.entropy + 0.5 * of.value_loss;
         (total, y, by_c)
     };
@@ -166,7 +169,8 @@ fn the_loss_gradient_equals_finite_differences_for_every_head() {
     check_loss_gradient(&bump, &drawn, &[], 4);
 }
 
-/// The written-out gradient of the networks against autograd, for a loss that mixes all of y.
+/// The written-out gradients of the networks, ours and libtorch's products, against autograd, for a loss
+/// that mixes all of y.
 #[test]
 fn network_gradients_equal_autograd() {
     let shape = Shape { inputs: 5, hidden: 16, outputs: 3, constants: 2 };
@@ -180,17 +184,6 @@ fn network_gradients_equal_autograd() {
         .map(|i| if i % 6 == 5 { 1.0 } else { random.random_range(-1.0..1.0) })
         .collect();
     let slopes: Vec<f32> = (0..4 * n).map(|_| random.random_range(-1.0..1.0)).collect();
-
-    // L = sum(slopes * y^2) + 3 c_0 - 2 c_1
-    let mut gradient = Vec::new();
-    let mut outputs = Vec::new();
-    network.differentiate(&inputs, &mut gradient, |y, _, by_c| {
-        outputs = y.to_vec();
-        for (y, slope) in y.iter_mut().zip(&slopes) {
-            *y *= 2.0 * slope;
-        }
-        by_c.copy_from_slice(&[3.0, -2.0]);
-    });
 
     let flat = Tensor::from_slice(network.parameters()).set_requires_grad(true);
     let piece = |start: usize, rows: usize, columns: usize| {
@@ -208,24 +201,37 @@ fn network_gradients_equal_autograd() {
             .mm(&hidden.narrow(0, units.0 as i64, units.1 as i64))
     };
     let y = Tensor::cat(&[half((0, k), (0, h)), half((k, 1), (h, h))], 0) + bias;
-    let slopes = Tensor::from_slice(&slopes).view([(k + 1) as i64, -1]);
-    let constants = flat.narrow(0, shape.constants_at() as i64, 2);
-    let total = (&slopes * y.square()).sum(Kind::Float)
-        + (constants * Tensor::from_slice(&[3f32, -2.0])).sum(Kind::Float);
-    total.backward();
+    let slopes_of_y = Tensor::from_slice(&slopes).view([(k + 1) as i64, -1]);
+    (&slopes_of_y * y.square()).sum(Kind::Float).backward(); // L = sum(slopes * y^2)
     let truth = Vec::<f32>::try_from(flat.grad()).unwrap();
-    for (i, (written, truth)) in gradient.iter().zip(&truth).enumerate() {
-        assert!((written - truth).abs() < 1e-5 * (1.0 + truth.abs()), "{i}: {written}, {truth}");
-    }
-    for (ours, theirs) in outputs.iter().zip(Vec::<f32>::try_from(y.reshape([-1])).unwrap()) {
-        assert!((ours - theirs).abs() < 1e-5, "{ours} against {theirs}");
-    }
-
-    let (mut acted, mut values) = (Vec::new(), Vec::new());
-    network.act(&inputs, &mut acted);
-    network.values(&inputs, &mut values);
-    for (one, other) in outputs.iter().zip(acted.iter().chain(&values)) {
-        assert!((one - other).abs() < 1e-5, "actor and critic alone: {one} against {other}");
+    let y = Vec::<f32>::try_from(y.reshape([-1])).unwrap();
+    let by_libtorch = Network::by_libtorch(shape, network.parameters().to_vec(), Device::Cpu);
+    for mut network in [network, by_libtorch] {
+        let (mut gradient, mut outputs) = (Vec::new(), vec![0.0; slopes.len()]);
+        network.differentiate(&inputs, &mut gradient, |Outputs { start, samples, y, stride }| {
+            for (row, y) in y.chunks_exact_mut(stride).enumerate() {
+                for (i, y) in y[..samples].iter_mut().enumerate() {
+                    let at = row * n + start + i;
+                    outputs[at] = *y;
+                    *y *= 2.0 * slopes[at];
+                }
+            }
+        });
+        for (i, (written, truth)) in gradient.iter().zip(&truth).enumerate() {
+            assert!(
+                (written - truth).abs() < 1e-5 * (1.0 + truth.abs()),
+                "{i}: {written}, {truth}"
+            );
+        }
+        for (ours, theirs) in outputs.iter().zip(&y) {
+            assert!((ours - theirs).abs() < 1e-5, "{ours} against {theirs}");
+        }
+        let (mut acted, mut values) = (Vec::new(), Vec::new());
+        network.act(&inputs, &mut acted);
+        network.values(&inputs, &mut values);
+        for (one, other) in outputs.iter().zip(acted.iter().chain(&values)) {
+            assert!((one - other).abs() < 1e-5, "actor and critic alone: {one} against {other}");
+        }
     }
 }
 
