@@ -291,10 +291,17 @@ pub struct ExactArgs {
 
 /// Make the table of results of a folder again and print it.
 #[derive(Debug, Args)]
+#[command(after_help = "\
+Examples:
+  cvar-game table results/quick
+  cvar-game table results/paper --compare results/ablations/executed --compare my-method")]
 pub struct TableArgs {
     /// Output folder of `bench` or `train`.
     #[arg(value_name = "DIR")]
     pub folder: PathBuf,
+    /// Another such folder, to be put beside DIR in comparison.md, .csv and .tex. May be repeated.
+    #[arg(long, value_name = "DIR")]
+    pub compare: Vec<PathBuf>,
     /// Print the table as JSON and write nothing.
     #[arg(long)]
     pub json: bool,
@@ -435,10 +442,13 @@ fn exact(args: &ExactArgs) -> Result<ExitCode> {
 
 fn table(args: &TableArgs) -> Result<ExitCode> {
     if args.json {
-        answer::print_json(&report::table_json(&args.folder)?)
-    } else {
-        answer::print(&report::write(&args.folder)?)
+        return answer::print_json(&report::table_json(&args.folder, &args.compare)?);
     }
+    answer::print(&if args.compare.is_empty() {
+        report::write(&args.folder)?
+    } else {
+        report::write_comparison(&args.folder, &args.compare)?
+    })
 }
 
 fn envs(args: &EnvsArgs) -> Result<ExitCode> {
