@@ -79,6 +79,7 @@ pub enum PlayVerb {
 pub enum LookVerb {
     Exact(ExactArgs),
     Table(TableArgs),
+    Figures(FolderArgs),
     Envs(EnvsArgs),
     Config(PrintArgs),
 }
@@ -307,6 +308,14 @@ pub struct TableArgs {
     pub json: bool,
 }
 
+/// Draw the figures of a results folder into its subfolder `figures`, as SVG and PNG.
+#[derive(Debug, Args)]
+pub struct FolderArgs {
+    /// Output folder of `bench` or `train`.
+    #[arg(value_name = "DIR")]
+    pub folder: PathBuf,
+}
+
 /// List the worlds with their constants.
 #[derive(Debug, Args)]
 pub struct EnvsArgs {
@@ -398,6 +407,7 @@ pub fn look(verb: LookVerb) -> Result<ExitCode> {
     match verb {
         LookVerb::Exact(args) => exact(&args),
         LookVerb::Table(args) => table(&args),
+        LookVerb::Figures(args) => figures(&args),
         LookVerb::Envs(args) => envs(&args),
         LookVerb::Config(args) => {
             let options = args.env.map(select).into_iter().collect();
@@ -449,6 +459,26 @@ fn table(args: &TableArgs) -> Result<ExitCode> {
     } else {
         report::write_comparison(&args.folder, &args.compare)?
     })
+}
+
+fn figures(args: &FolderArgs) -> Result<ExitCode> {
+    let figures = report::write_figures(&args.folder)?;
+    let mut text = String::new();
+    for figure in &figures.drawn {
+        text += &format!(
+            "{}\n",
+            args.folder.join("figures").join(&figure.name).with_extension("svg").display()
+        );
+    }
+    tell_missing(&figures);
+    answer::print(&text)
+}
+
+/// Says which figures the artefacts did not allow.
+fn tell_missing(figures: &report::figures::Figures) {
+    if !figures.missing.is_empty() {
+        eprintln!("left out, for want of artefacts: {}", figures.missing.join("; "));
+    }
 }
 
 fn envs(args: &EnvsArgs) -> Result<ExitCode> {

@@ -6,10 +6,11 @@
 //! | what are worlds and runs called | [`names`] |
 //! | which runs does a configuration mean | [`plan`] |
 //! | how are they carried out, many at a time | [`runner`] |
-//! | what does a run leave behind | [`artefacts`] |
+//! | what does a run leave behind | [`artefacts`], [`exhibits`] |
 
 pub mod artefacts;
 pub mod config;
+pub mod exhibits;
 pub mod names;
 pub mod plan;
 pub mod runner;

@@ -11,7 +11,9 @@
 //! Nothing is simulated and nothing drawn except the bootstrap, whose streams are named: the same
 //! artefacts give the same bytes.
 
+pub mod archive;
 pub mod cross;
+pub mod figures;
 pub mod group;
 pub mod latex;
 pub mod render;
@@ -19,6 +21,7 @@ pub mod runs;
 pub mod statistics;
 pub mod table;
 
+use figures::Figures;
 use group::groups;
 use latex::Latex;
 use render::{Csv, Json, Markdown, Render, Terminal};
@@ -117,6 +120,29 @@ pub fn write_comparison(dir: &Path, others: &[PathBuf]) -> Result<String, Report
 /// As [`write()`].
 pub fn table_json(dir: &Path, others: &[PathBuf]) -> Result<serde_json::Value, ReportError> {
     with_comparison(dir, others, |table| Ok(Json.value(table)))
+}
+
+/// Draws the figures of the runs below `dir` into `DIR/figures`, each as SVG and PNG.
+///
+/// # Errors
+/// As [`write()`].
+pub fn write_figures(dir: &Path) -> Result<Figures, ReportError> {
+    let runs = Runs::read(dir)?;
+    let figures = figures::draw(&groups(&runs))?;
+    let folder = dir.join("figures");
+    std::fs::create_dir_all(&folder)
+        .map_err(|source| ReportError::Write { path: folder.clone(), source })?;
+    for figure in &figures.drawn {
+        let stem = folder.join(&figure.name);
+        persist(&stem.with_extension("svg"), figure.svg.as_bytes())?;
+        let path = stem.with_extension("png");
+        let png = figures::png(&figure.svg).map_err(|what| ReportError::Write {
+            path: path.clone(),
+            source: std::io::Error::other(what),
+        })?;
+        persist(&path, &png)?;
+    }
+    Ok(figures)
 }
 
 fn with_comparison<T>(

@@ -68,6 +68,8 @@ pub struct Run {
     pub seconds: f64,
     /// What the evaluation found; a failed run may have none.
     pub evaluation: Option<Evaluation>,
+    /// Where all that lies.
+    pub folder: PathBuf,
 }
 
 impl Run {
@@ -308,12 +310,13 @@ fn read_run(folder: &Path, env: &str, eta: f64, seed: u64) -> Result<Option<Run>
     let trained = (evaluation.as_ref().map(|of| (of.steps, of.seconds)))
         .or(manifest.map(|of| (of.steps, of.seconds)));
     let (steps, seconds) = trained.unwrap_or_default();
-    Ok(Some(Run { env: env.to_owned(), eta, seed, failure, steps, seconds, evaluation }))
+    let (env, folder) = (env.to_owned(), folder.to_owned());
+    Ok(Some(Run { env, eta, seed, failure, steps, seconds, evaluation, folder }))
 }
 
 /// Reads a file of ours; `None` if there is none. The version is looked at first: what another
 /// version wrote is not damaged.
-fn read_json<T: DeserializeOwned>(path: &Path) -> Result<Option<T>, ReportError> {
+pub(super) fn read_json<T: DeserializeOwned>(path: &Path) -> Result<Option<T>, ReportError> {
     let text = match std::fs::read(path) {
         Ok(text) => text,
         Err(error) if error.kind() == std::io::ErrorKind::NotFound => return Ok(None),
