@@ -79,7 +79,8 @@ pub enum PlayVerb {
 pub enum LookVerb {
     Exact(ExactArgs),
     Table(TableArgs),
-    Figures(FolderArgs),
+    Figures(FiguresArgs),
+    Report(ReportArgs),
     Envs(EnvsArgs),
     Config(PrintArgs),
 }
@@ -310,7 +311,17 @@ pub struct TableArgs {
 
 /// Draw the figures of a results folder into its subfolder `figures`, as SVG and PNG.
 #[derive(Debug, Args)]
-pub struct FolderArgs {
+pub struct FiguresArgs {
+    /// Output folder of `bench` or `train`.
+    #[arg(value_name = "DIR")]
+    pub folder: PathBuf,
+}
+
+/// Write everything about a results folder anew: tables, figures and report.html.
+///
+/// The page needs no network and no other file.
+#[derive(Debug, Args)]
+pub struct ReportArgs {
     /// Output folder of `bench` or `train`.
     #[arg(value_name = "DIR")]
     pub folder: PathBuf,
@@ -408,6 +419,7 @@ pub fn look(verb: LookVerb) -> Result<ExitCode> {
         LookVerb::Exact(args) => exact(&args),
         LookVerb::Table(args) => table(&args),
         LookVerb::Figures(args) => figures(&args),
+        LookVerb::Report(args) => report(&args.folder),
         LookVerb::Envs(args) => envs(&args),
         LookVerb::Config(args) => {
             let options = args.env.map(select).into_iter().collect();
@@ -461,17 +473,21 @@ fn table(args: &TableArgs) -> Result<ExitCode> {
     })
 }
 
-fn figures(args: &FolderArgs) -> Result<ExitCode> {
+fn figures(args: &FiguresArgs) -> Result<ExitCode> {
     let figures = report::write_figures(&args.folder)?;
-    let mut text = String::new();
-    for figure in &figures.drawn {
-        text += &format!(
-            "{}\n",
-            args.folder.join("figures").join(&figure.name).with_extension("svg").display()
-        );
-    }
     tell_missing(&figures);
-    answer::print(&text)
+    answer::print(&format!(
+        "{} figures written to {}",
+        figures.drawn.len(),
+        args.folder.join("figures").display()
+    ))
+}
+
+fn report(folder: &Path) -> Result<ExitCode> {
+    report::write(folder)?;
+    tell_missing(&report::write_figures(folder)?);
+    report::write_page(folder)?;
+    answer::print(&folder.join("report.html").display().to_string())
 }
 
 /// Says which figures the artefacts did not allow.

@@ -8,6 +8,7 @@
 //! | `manifest.json` | [`Manifest`]: where the run comes from |
 //! | `progress.csv` | one line per update of a player |
 //! | `final.safetensors` | weights of both players at the end, never the best |
+//! | `exhibits.json` | [`super::exhibits`]: what figures need beyond numbers |
 //! | `evaluation.json` | [`Evaluation`]; written last, so that a run with it is finished |
 
 use super::names::RunId;

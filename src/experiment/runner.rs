@@ -386,7 +386,7 @@ pub fn read_evaluation(folder: &Path) -> Result<Option<Evaluation>, RunnerError>
 /// Makes the folder, removes what an earlier attempt left and writes `config.toml`.
 fn clear(run: &RunConfig, folder: &Path) -> io::Result<()> {
     fs::create_dir_all(folder)?;
-    for name in ["manifest.json", "progress.csv", "final.safetensors", LOG] {
+    for name in ["manifest.json", "progress.csv", "final.safetensors", "exhibits.json", LOG] {
         match fs::remove_file(folder.join(name)) {
             Err(error) if error.kind() != io::ErrorKind::NotFound => return Err(error),
             _ => {}

@@ -70,14 +70,14 @@ pub enum TrainError {
 
 /// Trains a pair of players on `world`, whose slots are the parallel episodes.
 ///
-/// `observe` is told of every update.
+/// `observe` is told of every update and shown the pair as it is then.
 ///
 /// # Errors
 /// [`TrainError::NotFinite`] at the first quantity that is not a finite number.
 pub fn train<W: Arena>(
     world: W,
     game: &Game<'_>,
-    mut observe: impl FnMut(&Progress),
+    mut observe: impl FnMut(&Progress, &Pair<W>),
 ) -> Result<Pair<W>, TrainError> {
     let options = game.options;
     let mut pair = Pair::<W>::new(options, game.eta, game.seed, game.device);
@@ -109,7 +109,7 @@ pub fn train<W: Arena>(
         if let Some(quantity) = diverged {
             return Err(TrainError::NotFinite { update: turn.update, role: turn.role, quantity });
         }
-        observe(&Progress {
+        let progress = &Progress {
             update: turn.update,
             steps: turn.update * options.rollout(),
             role: turn.role,
@@ -120,7 +120,8 @@ pub fn train<W: Arena>(
             learning_rate: rates.learning_rate,
             losses,
             budget_use: collector.budget_use,
-        });
+        };
+        observe(&progress, &pair);
     }
     Ok(pair)
 }

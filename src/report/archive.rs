@@ -53,7 +53,8 @@ struct Constants {
     env: WorldConfig,
 }
 
-fn world(path: &Path) -> Result<Option<(WorldConfig, f64)>, ReportError> {
+/// Constants of the world and gamma.
+pub(super) fn world(path: &Path) -> Result<Option<(WorldConfig, f64)>, ReportError> {
     let Some(text) = text(path)? else { return Ok(None) };
     let constants: Constants = toml::from_str(&text).map_err(|error| ReportError::Corrupt {
         path: path.to_path_buf(),

@@ -16,6 +16,7 @@ pub mod cross;
 pub mod figures;
 pub mod group;
 pub mod latex;
+pub mod page;
 pub mod render;
 pub mod runs;
 pub mod statistics;
@@ -120,6 +121,23 @@ pub fn write_comparison(dir: &Path, others: &[PathBuf]) -> Result<String, Report
 /// As [`write()`].
 pub fn table_json(dir: &Path, others: &[PathBuf]) -> Result<serde_json::Value, ReportError> {
     with_comparison(dir, others, |table| Ok(Json.value(table)))
+}
+
+/// Writes `report.html` into `dir`: tables, figures and stored episodes on one page that needs no
+/// other file.
+///
+/// # Errors
+/// As [`write()`].
+pub fn write_page(dir: &Path) -> Result<Figures, ReportError> {
+    let runs = Runs::read(dir)?;
+    let groups = groups(&runs);
+    let figures = figures::draw(&groups)?;
+    let name = names(&[dir]).remove(0);
+    let results = [Results { name: &name, runs: &runs, groups }];
+    let table = Table::new(&results);
+    let page = page::render(&name, &table, &results[0].groups, &figures)?;
+    persist(&dir.join("report.html"), page.as_bytes())?;
+    Ok(figures)
 }
 
 /// Draws the figures of the runs below `dir` into `DIR/figures`, each as SVG and PNG.

@@ -358,7 +358,7 @@ fn one_seed_gives_the_same_weights() {
     let run = || {
         let world = LavaGrid::new(&GridConfig::default(), 50).unwrap();
         let options = options();
-        let pair = train::<LavaGrid>(world, &game(&options, 25.0), |_| {}).unwrap();
+        let pair = train::<LavaGrid>(world, &game(&options, 25.0), |_, _| {}).unwrap();
         weights::to_bytes(&pair, String::new()).unwrap()
     };
     assert_eq!(run(), run());
@@ -413,7 +413,8 @@ fn a_learning_rate_that_diverges_is_diagnosed() {
     let mut options = options();
     options.protagonist.learning_rate = 1e30;
     let world = LavaGrid::new(&GridConfig::default(), 50).unwrap();
-    let error = train::<LavaGrid>(world, &game(&options, 1.0), |_| {}).err().unwrap().to_string();
+    let error =
+        train::<LavaGrid>(world, &game(&options, 1.0), |_, _| {}).err().unwrap().to_string();
     assert!(error.contains("of the protagonist is not finite at update"), "{error}");
 }
 
@@ -506,7 +507,7 @@ fn the_pair_learns_a_two_step_game_to_its_value() {
     }
     for (budget, sure, known) in [(1.0, -0.6, 0.25), (2.0, -0.6, -0.6), (2.0, -1.5, -1.0)] {
         let world = || TwoCoins { sure, slots: vec![(0, false); 100] };
-        let pair = train::<TwoCoins>(world(), &game(&options, budget), |_| {}).unwrap();
+        let pair = train::<TwoCoins>(world(), &game(&options, budget), |_, _| {}).unwrap();
         let chance = if budget == 1.0 { Chance::Nominal } else { Chance::Antagonist };
         let setting = Play {
             choosing: Choosing::Greedy,

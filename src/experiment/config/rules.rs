@@ -72,6 +72,7 @@ const RULES: &[(&str, Rule)] = &[
     ("train.bump.center", Number(Excluded(0.0), Included(100.0))),
     ("train.bump.curvature", Number(Excluded(0.0), Included(1e6))),
     ("evaluation.episodes", COUNT),
+    ("evaluation.exhibit_episodes", COUNT),
     ("evaluation.parallel_episodes", SIZE),
     ("evaluation.seed", Whole(0, i64::MAX)),
     ("evaluation.alphas", Number(Excluded(0.0), Included(1.0))),

@@ -180,7 +180,7 @@ fn training<W: Bench>(criterion: &mut Criterion) {
         bencher.iter_batched(
             || W::build(&options),
             |world| {
-                train(world, &game, |progress| {
+                train(world, &game, |progress, _| {
                     black_box(progress);
                 })
             },

@@ -1,6 +1,7 @@
 //! One run, from its configuration to its artefacts: train, keep the weights, evaluate.
 
-use super::evaluation::{self, Yardstick};
+use super::evaluation;
+use super::exhibits::{Exhibited, exhibits};
 use super::failure::RunError;
 use crate::train::{Game, Progress, train};
 use crate::weights;
@@ -12,6 +13,9 @@ use std::fs::File;
 use std::io::{self, BufWriter, Write};
 use std::path::Path;
 use std::time::Instant;
+
+/// Points of the curve of the regret in training.
+const REGRET_POINTS: u64 = 40;
 
 /// Carries out the run and leaves its artefacts in `folder`, `evaluation.json` last.
 ///
@@ -29,7 +33,7 @@ pub fn execute(
     }
 }
 
-fn carry_out<W: Yardstick>(
+fn carry_out<W: Exhibited>(
     run: &RunConfig,
     constants: &W::Constants,
     folder: &Path,
@@ -48,12 +52,22 @@ fn carry_out<W: Yardstick>(
     let start = Instant::now();
     let mut written = Ok(());
     let mut last = Tick { steps: 0, mean_return: f64::NAN };
-    let trained = train::<W>(world, &game, |of| {
+    let meter = W::regret_meter(constants, run)?;
+    let mut regret = Ok(Vec::new());
+    let trained = train::<W>(world, &game, |of, pair| {
         if written.is_ok() {
             written = progress.add(of, start.elapsed().as_secs_f64());
         }
         last = Tick { steps: of.steps, mean_return: of.mean_return };
         report(last);
+        if let (Some(meter), Ok(points)) = (&meter, &mut regret)
+            && of.steps * REGRET_POINTS >= points.len() as u64 * run.train.steps
+        {
+            match meter(pair) {
+                Ok(now) => points.push((of.steps, now)),
+                Err(error) => regret = Err(error),
+            }
+        }
     });
     let seconds = start.elapsed().as_secs_f64();
     written.and_then(|()| progress.finish()).map_err(RunError::file(&path))?;
@@ -79,6 +93,10 @@ fn carry_out<W: Yardstick>(
         audit: found.audit,
         certificate: found.certificate,
     };
+    let shown = exhibits(run, constants, &pair, regret?)?;
+    let text = serde_json::to_vec(&shown).map_err(io::Error::other);
+    let path = folder.join("exhibits.json");
+    text.and_then(|text| write_in_place(&path, &text)).map_err(RunError::file(&path))?;
     write_json(&folder.join("evaluation.json"), &evaluation)
 }
 

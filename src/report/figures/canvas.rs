@@ -86,12 +86,15 @@ pub(super) type Chart<'a, 'b> = ChartContext<
 /// A panel with a title, axes and faint lines.
 pub(super) fn chart<'a, 'b>(
     area: &'a Area<'b>,
-    title: (&str, RGBColor),
+    title: &str,
     axes: Axes,
 ) -> Result<Chart<'a, 'b>, DrawingAreaErrorKind<std::io::Error>> {
-    let mut chart = ChartBuilder::on(area)
+    let mut builder = ChartBuilder::on(area);
+    if !title.is_empty() {
+        builder.caption(title, ("sans-serif", TEXT + 4).into_font().color(&INK));
+    }
+    let mut chart = builder
         .margin(18)
-        .caption(title.0, ("sans-serif", TEXT + 4).into_font().color(&title.1))
         .x_label_area_size(74)
         .y_label_area_size(104)
         .build_cartesian_2d(axes.x, axes.y)?;
@@ -153,6 +156,14 @@ pub(super) fn scale(area: &Area, title: &str, ends: [String; 2]) -> Drawn {
     let [low, high] = ends;
     area.draw(&Text::new(low, (left - 12, middle), right_of(HPos::Right)))?;
     area.draw(&Text::new(high, (right + 12, middle), right_of(HPos::Left)))
+}
+
+/// A frame of two corners. As a path, because a rectangle's line has no width in SVG.
+pub(super) fn frame(
+    [(x0, y0), (x1, y1)]: [(i32, i32); 2],
+    style: ShapeStyle,
+) -> PathElement<(i32, i32)> {
+    PathElement::new(vec![(x0, y0), (x1, y0), (x1, y1), (x0, y1), (x0, y0)], style)
 }
 
 /// The font of PNGs: a machine may have none.

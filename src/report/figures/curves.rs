@@ -2,7 +2,7 @@
 
 use super::Panel;
 use super::canvas::{
-    Axes, INK, TEXT, chart, colour, figure, heat, legend, on, scale, short, span, text,
+    Axes, INK, TEXT, chart, colour, figure, frame, heat, legend, on, scale, short, span, text,
 };
 use crate::exact::grid::ExactGrid;
 use crate::experiment::exhibits::WorldExhibit;
@@ -15,7 +15,7 @@ use plotters::style::text_anchor::{HPos, VPos};
 const BINS: usize = 60;
 
 /// Budgets at which the curve of optima is evaluated, equally spaced in log eta.
-const OPTIMA: u32 = 24;
+const OPTIMA: u32 = 60;
 
 /// Middle of a band and its ends.
 #[derive(Debug, Clone, Copy)]
@@ -62,12 +62,14 @@ fn bands(
             .map(|((place, panel), _)| (format!("eta = {}", panel.group.eta), colour(place)))
             .collect();
         legend(&top, &words)?;
-        let mut chart = chart(&below, ("", INK), Axes { x, y, x_title, y_title })?;
+        let mut chart = chart(&below, "", Axes { x, y, x_title, y_title })?;
         for (place, band) in bands.iter().enumerate() {
             let outline = band.iter().map(|band| (band.x, band.high));
             let back = band.iter().rev().map(|band| (band.x, band.low));
             let area: Vec<(f64, f64)> = outline.chain(back).collect();
             chart.draw_series(std::iter::once(Polygon::new(area, colour(place).mix(0.18))))?;
+        }
+        for (place, band) in bands.iter().enumerate() {
             let line = band.iter().map(|band| (band.x, band.middle));
             chart.draw_series(LineSeries::new(line, colour(place).stroke_width(4)))?;
         }
@@ -215,7 +217,7 @@ pub(super) fn frontier(
         {
             let title = format!("alpha = {}", short(alpha));
             let axes = Axes { x: x.clone(), y: y.clone(), x_title: "CVaR_alpha", y_title: "mean" };
-            let mut chart = chart(area, (&title, INK), axes)?;
+            let mut chart = chart(area, &title, axes)?;
             chart.draw_series(LineSeries::new(curve.iter().copied(), INK.stroke_width(3)))?;
             chart.draw_series(curve.iter().map(|&point| Circle::new(point, 4, INK.filled())))?;
             chart.draw_series(
@@ -282,7 +284,7 @@ pub(super) fn cross(panels: &[Panel]) -> Option<(String, String)> {
                 // The level that the row was trained for.
                 if (ALPHAS[column] * panel.group.eta - 1.0).abs() < 1e-9 {
                     let inner = [(x + 4, y + 4), (x + width - 4, y + height - 4)];
-                    canvas.draw(&Rectangle::new(inner, on(shade).stroke_width(4)))?;
+                    canvas.draw(&frame(inner, on(shade).stroke_width(4)))?;
                 }
             }
         }

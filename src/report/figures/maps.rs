@@ -2,7 +2,7 @@
 
 use super::Panel;
 use super::canvas::{
-    Area, Drawn, FAINT, GOAL, INK, LAVA, TEXT, colour, figure, heat, on, scale, short, text,
+    Area, Drawn, FAINT, GOAL, INK, LAVA, TEXT, colour, figure, frame, heat, on, scale, short, text,
 };
 use crate::experiment::exhibits::{
     BINS_PER_METRE, BUDGET_CLASSES, Deviations, GridExhibit, PointExhibit, ShiftMap, WorldExhibit,
@@ -28,6 +28,8 @@ struct Layout {
     columns: usize,
     rows: usize,
     extent: (f64, f64),
+    /// Height of the strip below them.
+    strip: i32,
 }
 
 impl Layout {
@@ -38,7 +40,7 @@ impl Layout {
 
     fn size(&self) -> (u32, u32) {
         let (width, height) = self.pitch();
-        ((width * self.columns as i32) as u32, (height * self.rows as i32 + STRIP) as u32)
+        ((width * self.columns as i32) as u32, (height * self.rows as i32 + self.strip) as u32)
     }
 
     fn origin(&self, column: usize, row: usize) -> (i32, i32) {
@@ -73,10 +75,10 @@ fn cells(canvas: &Area, grid: &LavaGrid, origin: (i32, i32)) -> Drawn {
             canvas.draw(&Rectangle::new(corners, GOAL.filled()))?;
             canvas.draw(&Text::new("G", middle, centred(on(GOAL))))?;
         }
-        canvas.draw(&Rectangle::new(corners, FAINT.stroke_width(1)))?;
+        canvas.draw(&frame(corners, FAINT.stroke_width(1)))?;
     }
     let corners = [origin, at(origin, width as f64, height as f64)];
-    canvas.draw(&Rectangle::new(corners, INK.stroke_width(2)))
+    canvas.draw(&frame(corners, INK.stroke_width(3)))
 }
 
 /// Values of cells as colours with their numbers; `None` stays empty.
@@ -97,7 +99,7 @@ fn heat_map(
         let corners = [at(origin, x, y), at(origin, x + 1.0, y + 1.0)];
         canvas.draw(&Rectangle::new(corners, shade.filled()))?;
         let style = text(19, on(shade), HPos::Center, VPos::Center);
-        let number = format!("{value:.2}");
+        let number = format!("{value:.*}", if value < 10.0 { 2 } else { 0 });
         let number = number.strip_prefix('0').unwrap_or(&number).to_owned();
         canvas.draw(&Text::new(number, at(origin, x + 0.5, y + 0.5), style))?;
     }
@@ -110,7 +112,7 @@ fn whole(grid: &LavaGrid) -> (f64, f64) {
 
 pub(super) fn grid(config: &GridConfig) -> Option<(String, String)> {
     let grid = LavaGrid::new(config, 1).ok()?;
-    let layout = Layout { columns: 1, rows: 1, extent: whole(&grid) };
+    let layout = Layout { columns: 1, rows: 1, extent: whole(&grid), strip: 0 };
     let svg = figure(layout.size(), |canvas| {
         let origin = layout.origin(0, 0);
         cells(canvas, &grid, origin)?;
@@ -150,7 +152,7 @@ pub(super) fn occupancy(config: &GridConfig, panels: &[Panel]) -> Option<(String
         return None;
     }
     let greatest = 1.0;
-    let layout = Layout { columns: maps.len(), rows: 1, extent: whole(&grid) };
+    let layout = Layout { columns: maps.len(), rows: 1, extent: whole(&grid), strip: STRIP };
     let svg = figure(layout.size(), |canvas| {
         for (column, (panel, values)) in maps.iter().enumerate() {
             let origin = layout.origin(column, 0);
@@ -194,7 +196,7 @@ pub(super) fn deviations(config: &GridConfig, panels: &[Panel]) -> Option<(Strin
     if maps.is_empty() {
         return None;
     }
-    let layout = Layout { columns: maps.len(), rows: 2, extent: whole(&grid) };
+    let layout = Layout { columns: maps.len(), rows: 2, extent: whole(&grid), strip: STRIP };
     let svg = figure(layout.size(), |canvas| {
         for (column, (panel, maps)) in maps.iter().enumerate() {
             for (row, (name, values)) in
@@ -229,7 +231,7 @@ fn arena(canvas: &Area, config: &PointConfig, origin: (i32, i32)) -> Drawn {
     let start = at(origin, config.start[0], config.start[1]);
     canvas.draw(&Circle::new(start, 7, INK.stroke_width(3)))?;
     let corners = [origin, at(origin, config.arena[0], config.arena[1])];
-    canvas.draw(&Rectangle::new(corners, INK.stroke_width(2)))
+    canvas.draw(&frame(corners, INK.stroke_width(3)))
 }
 
 fn of_point<'a>(panel: &'a Panel) -> impl Iterator<Item = &'a PointExhibit> {
@@ -246,7 +248,7 @@ pub(super) fn trajectories(config: &PointConfig, panels: &[Panel]) -> Option<(St
         return None;
     }
     let layout =
-        Layout { columns: shown.len(), rows: 1, extent: (config.arena[0], config.arena[1]) };
+        Layout { columns: shown.len(), rows: 1, extent: config.arena.into(), strip: STRIP };
     let svg = figure(layout.size(), |canvas| {
         for (column, (place, panel)) in shown.iter().enumerate() {
             let origin = layout.origin(column, 0);
@@ -314,7 +316,8 @@ pub(super) fn shifts(config: &PointConfig, panels: &[Panel]) -> Option<(String, 
     let layout = Layout {
         columns: maps.len(),
         rows: BUDGET_CLASSES,
-        extent: (config.arena[0], config.arena[1]),
+        extent: config.arena.into(),
+        strip: STRIP,
     };
     let svg = figure(layout.size(), |canvas| {
         for (column, (panel, classes)) in maps.iter().enumerate() {
