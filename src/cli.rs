@@ -484,9 +484,8 @@ fn figures(args: &FiguresArgs) -> Result<ExitCode> {
 }
 
 fn report(folder: &Path) -> Result<ExitCode> {
-    report::write(folder)?;
-    tell_missing(&report::write_figures(folder)?);
-    report::write_page(folder)?;
+    let written = report::write_all(folder)?;
+    tell_missing(&written.figures);
     answer::print(&folder.join("report.html").display().to_string())
 }
 

@@ -6,7 +6,7 @@
 //! | what are worlds and runs called | [`names`] |
 //! | which runs does a configuration mean | [`plan`] |
 //! | how are they carried out, many at a time | [`runner`] |
-//! | what does a run leave behind | [`artefacts`], [`exhibits`] |
+//! | what does a run leave behind | [`artefacts`], [`exhibits`], [`tensorboard`] |
 
 pub mod artefacts;
 pub mod config;
@@ -14,3 +14,4 @@ pub mod exhibits;
 pub mod names;
 pub mod plan;
 pub mod runner;
+pub mod tensorboard;

@@ -11,7 +11,7 @@ mod worker;
 use super::artefacts::{Evaluation, Manifest, SCHEMA, write_in_place};
 use super::config::{Config, ConfigError, RunConfig};
 use super::names::RunId;
-use super::plan;
+use super::{plan, tensorboard};
 use serde::{Deserialize, Deserializer, Serialize};
 use std::fs::{self, File, TryLockError};
 use std::io;
@@ -386,7 +386,14 @@ pub fn read_evaluation(folder: &Path) -> Result<Option<Evaluation>, RunnerError>
 /// Makes the folder, removes what an earlier attempt left and writes `config.toml`.
 fn clear(run: &RunConfig, folder: &Path) -> io::Result<()> {
     fs::create_dir_all(folder)?;
-    for name in ["manifest.json", "progress.csv", "final.safetensors", "exhibits.json", LOG] {
+    for name in [
+        "manifest.json",
+        "progress.csv",
+        tensorboard::FILE,
+        "final.safetensors",
+        "exhibits.json",
+        LOG,
+    ] {
         match fs::remove_file(folder.join(name)) {
             Err(error) if error.kind() != io::ErrorKind::NotFound => return Err(error),
             _ => {}

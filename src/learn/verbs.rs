@@ -77,7 +77,8 @@ fn bench(args: &BenchArgs) -> Result<ExitCode> {
     }
     let code = tell_failures(&outcome);
     if code == ExitCode::SUCCESS || outcome.finished > 0 {
-        print(&report::write(&out)?)?;
+        let written = report::write_all(&out)?;
+        print(&written.table)?;
         eprintln!("written to {}", out.display());
     }
     Ok(code)

@@ -8,6 +8,9 @@
 //! | `table.csv`, `table.md`, `table.tex` | statistics over seeds with intervals ([`table`]) | world and eta |
 //! | `cross.csv` | greedy CVaR of every policy at every alpha ([`cross`]) | world, eta and alpha |
 //!
+//! [`write_all`] adds `figures/` ([`figures`]) and `report.html` ([`page`]), and [`write_comparison`] puts
+//! several folders side by side.
+//!
 //! Nothing is simulated and nothing drawn except the bootstrap, whose streams are named: the same
 //! artefacts give the same bytes.
 
@@ -99,11 +102,42 @@ pub enum ReportError {
 /// be written. Nothing is written unless everything could be read.
 pub fn write(dir: &Path) -> Result<String, ReportError> {
     let runs = Runs::read(dir)?;
-    let groups = groups(&runs);
-    persist(&dir.join("runs.csv"), runs.to_csv().as_bytes())?;
-    persist(&dir.join("cross.csv"), cross::to_csv(&groups).as_bytes())?;
-    let table = Table::new(&[Results { name: "", runs: &runs, groups }]);
-    write_table(&table, &dir.join("table"))
+    write_tables(dir, &Results { name: "", runs: &runs, groups: groups(&runs) })
+        .map(|(_, terminal)| terminal)
+}
+
+/// What [`write_all`] has written.
+#[derive(Debug)]
+pub struct Written {
+    /// The table as text for a terminal.
+    pub table: String,
+    /// The figures, and those left out.
+    pub figures: Figures,
+}
+
+/// All that [`write()`] writes, the figures in `DIR/figures` as SVG and PNG, and `report.html`, a page
+/// with all of it and stored episodes that needs no other file.
+///
+/// # Errors
+/// As [`write()`].
+pub fn write_all(dir: &Path) -> Result<Written, ReportError> {
+    let runs = Runs::read(dir)?;
+    let name = names(&[dir]).remove(0);
+    let results = Results { name: &name, runs: &runs, groups: groups(&runs) };
+    let figures = figures::draw(&results.groups)?;
+    let (table, terminal) = write_tables(dir, &results)?;
+    let page = page::render(&name, &table, &results.groups, &figures)?;
+    persist_figures(dir, &figures)?;
+    persist(&dir.join("report.html"), page.as_bytes())?;
+    Ok(Written { table: terminal, figures })
+}
+
+fn write_tables(dir: &Path, results: &Results) -> Result<(Table, String), ReportError> {
+    persist(&dir.join("runs.csv"), results.runs.to_csv().as_bytes())?;
+    persist(&dir.join("cross.csv"), cross::to_csv(&results.groups).as_bytes())?;
+    let table = Table::new(std::slice::from_ref(results));
+    let terminal = write_table(&table, &dir.join("table"))?;
+    Ok((table, terminal))
 }
 
 /// Puts `dir` and `others` side by side, as `comparison.csv`, `comparison.md` and `comparison.tex` in
@@ -123,23 +157,6 @@ pub fn table_json(dir: &Path, others: &[PathBuf]) -> Result<serde_json::Value, R
     with_comparison(dir, others, |table| Ok(Json.value(table)))
 }
 
-/// Writes `report.html` into `dir`: tables, figures and stored episodes on one page that needs no
-/// other file.
-///
-/// # Errors
-/// As [`write()`].
-pub fn write_page(dir: &Path) -> Result<Figures, ReportError> {
-    let runs = Runs::read(dir)?;
-    let groups = groups(&runs);
-    let figures = figures::draw(&groups)?;
-    let name = names(&[dir]).remove(0);
-    let results = [Results { name: &name, runs: &runs, groups }];
-    let table = Table::new(&results);
-    let page = page::render(&name, &table, &results[0].groups, &figures)?;
-    persist(&dir.join("report.html"), page.as_bytes())?;
-    Ok(figures)
-}
-
 /// Draws the figures of the runs below `dir` into `DIR/figures`, each as SVG and PNG.
 ///
 /// # Errors
@@ -147,6 +164,11 @@ pub fn write_page(dir: &Path) -> Result<Figures, ReportError> {
 pub fn write_figures(dir: &Path) -> Result<Figures, ReportError> {
     let runs = Runs::read(dir)?;
     let figures = figures::draw(&groups(&runs))?;
+    persist_figures(dir, &figures)?;
+    Ok(figures)
+}
+
+fn persist_figures(dir: &Path, figures: &Figures) -> Result<(), ReportError> {
     let folder = dir.join("figures");
     std::fs::create_dir_all(&folder)
         .map_err(|source| ReportError::Write { path: folder.clone(), source })?;
@@ -160,7 +182,7 @@ pub fn write_figures(dir: &Path) -> Result<Figures, ReportError> {
         })?;
         persist(&path, &png)?;
     }
-    Ok(figures)
+    Ok(())
 }
 
 fn with_comparison<T>(

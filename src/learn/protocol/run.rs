@@ -8,11 +8,12 @@ use crate::weights;
 use cvar_game::experiment::artefacts::{Evaluation, Manifest, SCHEMA, write_in_place};
 use cvar_game::experiment::config::{RunConfig, WorldConfig};
 use cvar_game::experiment::runner::Tick;
+use cvar_game::experiment::tensorboard::EventFile;
 use lava_envs::{LavaGrid, LavaPoint};
 use std::fs::File;
 use std::io::{self, BufWriter, Write};
 use std::path::Path;
-use std::time::Instant;
+use std::time::{Instant, SystemTime, UNIX_EPOCH};
 
 /// Points of the curve of the regret in training.
 const REGRET_POINTS: u64 = 40;
@@ -41,7 +42,7 @@ fn carry_out<W: Exhibited>(
 ) -> Result<(), RunError> {
     let world = W::build(constants, run.train.parallel_episodes)?;
     let path = folder.join("progress.csv");
-    let mut progress = ProgressFile::create(&path).map_err(RunError::file(&path))?;
+    let mut progress = ProgressFile::create(folder).map_err(RunError::file(&path))?;
     let game = Game {
         eta: run.eta,
         gamma: run.gamma,
@@ -107,9 +108,12 @@ fn write_json(path: &Path, value: &impl serde::Serialize) -> Result<(), RunError
     write_in_place(path, text.as_bytes()).map_err(RunError::file(path))
 }
 
-/// `progress.csv`: a line per update. `seconds` is the only column that differs between two runs of
-/// one seed.
-struct ProgressFile(csv::Writer<BufWriter<File>>);
+/// `progress.csv`: a line per update; and the same for TensorBoard. `seconds` and the time of an event
+/// are all that differs between two runs of one seed.
+struct ProgressFile {
+    csv: csv::Writer<BufWriter<File>>,
+    events: EventFile,
+}
 
 impl ProgressFile {
     const COLUMNS: [&'static str; 18] = [
@@ -133,10 +137,11 @@ impl ProgressFile {
         "seconds",
     ];
 
-    fn create(path: &Path) -> io::Result<Self> {
-        let mut writer = csv::Writer::from_writer(BufWriter::new(File::create(path)?));
-        writer.write_record(Self::COLUMNS)?;
-        Ok(ProgressFile(writer))
+    fn create(folder: &Path) -> io::Result<Self> {
+        let file = File::create(folder.join("progress.csv"))?;
+        let mut csv = csv::Writer::from_writer(BufWriter::new(file));
+        csv.write_record(Self::COLUMNS)?;
+        Ok(ProgressFile { csv, events: EventFile::create(folder, wall_time())? })
     }
 
     fn add(&mut self, of: &Progress, seconds: f64) -> io::Result<()> {
@@ -159,10 +164,39 @@ impl ProgressFile {
         let head = [of.update.to_string(), of.steps.to_string(), of.role.to_string()];
         let timing = [format!("{:.0}", of.steps as f64 / seconds), format!("{seconds:.3}")];
         let record = head.into_iter().chain(numbers.map(|x| format!("{x:.6}"))).chain(timing);
-        Ok(self.0.write_record(record)?)
+        self.csv.write_record(record)?;
+        self.events.add(wall_time(), of.steps, &scalars(of, seconds))
     }
 
     fn finish(self) -> io::Result<()> {
-        self.0.into_inner().map_err(|error| io::Error::other(error.to_string()))?.flush()
+        self.csv.into_inner().map_err(|error| io::Error::other(error.to_string()))?.flush()
     }
+}
+
+/// The numbers of an update under the names that users of CleanRL know, by player.
+fn scalars(of: &Progress, seconds: f64) -> Vec<(String, f64)> {
+    let losses = &of.losses;
+    [
+        ("charts/episodic_return", of.mean_return),
+        ("charts/goal", of.goal),
+        ("charts/lava", of.lava),
+        ("charts/budget", of.budget),
+        ("charts/budget_use", of.budget_use),
+        ("charts/learning_rate", of.learning_rate),
+        ("charts/SPS", of.steps as f64 / seconds),
+        ("losses/policy_loss", losses.policy_loss),
+        ("losses/value_loss", losses.value_loss),
+        ("losses/entropy", losses.entropy),
+        ("losses/approx_kl", losses.approx_kl),
+        ("losses/clipfrac", losses.clip_fraction),
+        ("losses/gradient_norm", losses.gradient_norm),
+        ("losses/explained_variance", losses.explained_variance),
+    ]
+    .map(|(name, value)| (format!("{}/{name}", of.role), value))
+    .into()
+}
+
+/// Seconds since 1970.
+fn wall_time() -> f64 {
+    SystemTime::now().duration_since(UNIX_EPOCH).map_or(0.0, |time| time.as_secs_f64())
 }
