@@ -119,7 +119,7 @@ impl ExactGrid {
         WorstCase::new(&self.mdp, policy, eta)
     }
 
-    /// What a deterministic policy meets under its worst-case antagonist.
+    /// What a deterministic policy meets under its worst-case antagonist, whose budget is above 1.
     pub fn exposure(&self, policy: &Policy, worst: &WorstCase) -> Exposure {
         let cells = self.grid.cells();
         let (mut visits, mut deviations) = (vec![0.0; cells], vec![0.0; cells]);

@@ -109,7 +109,7 @@ pub fn train<W: Arena>(
         if let Some(quantity) = diverged {
             return Err(TrainError::NotFinite { update: turn.update, role: turn.role, quantity });
         }
-        let progress = &Progress {
+        let progress = Progress {
             update: turn.update,
             steps: turn.update * options.rollout(),
             role: turn.role,

@@ -43,12 +43,12 @@ fn environment(table: &Table, world: &World, block: Block) -> String {
         let mut values: Vec<String> =
             row_name(table, row).iter().map(|name| escaped(name)).chain([count]).collect();
         let mut below = vec![String::new(); headings.len() - 1];
-        below.push(failed.map_or(String::new(), small));
+        below.push(failed.as_deref().map_or(String::new(), small));
         for &(place, column) in &columns {
             let (value, interval) = words(column.format, row.cells[place]);
             let value = escaped(&value);
             values.push(if row.best[place] { format!("\\textbf{{{value}}}") } else { value });
-            below.push(interval.map_or(String::new(), small));
+            below.push(interval.as_deref().map_or(String::new(), small));
         }
         lines.push(values);
         if below.iter().any(|cell| !cell.is_empty()) {
@@ -71,8 +71,8 @@ fn environment(table: &Table, world: &World, block: Block) -> String {
     )
 }
 
-fn small(text: String) -> String {
-    format!("{{\\scriptsize {}}}", escaped(&text))
+fn small(text: &str) -> String {
+    format!("{{\\scriptsize {}}}", escaped(text))
 }
 
 /// A label takes no character that LaTeX reads.

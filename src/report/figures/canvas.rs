@@ -74,7 +74,7 @@ pub(super) fn span(values: impl Iterator<Item = f64>) -> Option<std::ops::Range<
         .filter(|value| value.is_finite())
         .fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), v| (low.min(v), high.max(v)));
     let air = 0.05 * (high - low).max(0.02);
-    (low <= high).then(|| low - air..high + air)
+    (low <= high).then_some(low - air..high + air)
 }
 
 pub(super) type Chart<'a, 'b> = ChartContext<
