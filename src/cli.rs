@@ -3,16 +3,18 @@
 //! There are two programs: `cvar-game`, which is not linked to libtorch, and `cvar-game-torch` (crate
 //! `cvar-learn`), to which it hands over what needs the networks.
 //!
-//! Exit codes: 0 done, 1 a run failed, 2 bad input or usage, 130 and 143 stopped by SIGINT and SIGTERM.
+//! Exit codes: 0 done, 1 a run failed, 2 bad input or usage, 75 stopped by SIGTERM and 130 by SIGINT,
+//! with checkpoints written: the same command goes on.
 //! Answers go to standard output, progress and errors to standard error.
 
 pub mod answer;
 
 use crate::exact::oracle;
+use crate::experiment::artefacts::BUILD;
 use crate::experiment::config::{
     Config, ConfigError, Device, Setting, WorldConfig, default_constants,
 };
-use crate::experiment::names::WorldName;
+use crate::experiment::names::{RunId, WorldName};
 use crate::game::budget::Eta;
 use crate::{exact, report};
 use anyhow::{Context, Result, bail};
@@ -37,7 +39,11 @@ Examples:
   cvar-game exact --env lava-grid --eta 25
       the best CVaR_0.04 there is on the grid
   cvar-game config --set env.slip=0.1
-      what a configuration comes to; all options are explained in configs/default.toml"
+      what a configuration comes to; all options are explained in configs/default.toml
+
+Exit codes:
+  0 done, 1 a run failed, 2 bad input or usage;
+  75 stopped by SIGTERM, 130 by Ctrl-C: the same command goes on where it was"
 )]
 pub struct Cli {
     #[command(subcommand)]
@@ -112,13 +118,16 @@ impl Overrides {
 
 /// Train and evaluate every run of a configuration, then print the table of results.
 ///
-/// Finished runs are kept: the same command goes on where it was stopped.
+/// Finished runs are kept and unfinished ones go on from their last checkpoint: the same command goes
+/// on where it was stopped, with the same results. Several may work on one folder at once, on one
+/// machine or many: no run is done twice.
 #[derive(Debug, Args)]
 #[command(after_help = "\
 Examples:
   cvar-game bench --config configs/quick.toml
   cvar-game bench --config configs/paper.toml --out results/slippery --set env.slip=0.1
-  cvar-game bench --config configs/quick.toml --jobs 1 --set 'experiment.seeds=[1]' --out /tmp/try")]
+  cvar-game bench --config configs/quick.toml --jobs 1 --set 'experiment.seeds=[1]' --out /tmp/try
+  cvar-game bench --config configs/paper.toml --only lava-grid/eta-25/seed-3")]
 pub struct BenchArgs {
     /// Configuration file.
     #[arg(long, value_name = "FILE")]
@@ -129,6 +138,9 @@ pub struct BenchArgs {
     /// Runs at the same time, one thread each [default: the processor's cores].
     #[arg(long, value_name = "N", value_parser = at_least_one)]
     pub jobs: Option<NonZeroUsize>,
+    /// This run of the configuration alone, and no table: for schedulers, one task per run.
+    #[arg(long, value_name = "RUN_ID")]
+    pub only: Option<RunId>,
     /// Device of the networks: cpu, cuda or cuda:N.
     #[arg(long)]
     pub device: Option<Device>,
@@ -344,8 +356,6 @@ pub fn run(cli: Cli) -> Result<ExitCode> {
 
 /// The program that plays, beside this one.
 const PLAYER: &str = "cvar-game-torch";
-/// What both programs were built from.
-const BUILD: &str = env!("CVAR_GAME_BUILD");
 /// How the one tells it to the other.
 const BUILD_VARIABLE: &str = "CVAR_GAME_BUILD";
 

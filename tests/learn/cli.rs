@@ -295,7 +295,7 @@ mod runs {
 
     #[test]
     fn a_signal_stops_the_workers_and_sets_the_exit_code() {
-        for (name, code) in [("-INT", 130), ("-TERM", 143)] {
+        for (name, code) in [("-INT", 130), ("-TERM", 75)] {
             let folder = tempfile::tempdir().unwrap();
             let out = folder.path().join("out");
             let mut child = endless(&folder, &out);
