@@ -12,9 +12,12 @@ pub mod answer;
 use crate::exact::oracle;
 use crate::experiment::artefacts::BUILD;
 use crate::experiment::config::{
-    Config, ConfigError, Device, Setting, WorldConfig, default_constants,
+    Config, ConfigError, Device, RunConfig, Setting, WorldConfig, default_constants,
 };
 use crate::experiment::names::{RunId, WorldName};
+use crate::experiment::plan;
+use crate::experiment::runner;
+use crate::experiment::slurm::{self, Wishes};
 use crate::game::budget::Eta;
 use crate::{exact, report};
 use anyhow::{Context, Result, bail};
@@ -85,6 +88,7 @@ pub enum PlayVerb {
 pub enum LookVerb {
     Exact(ExactArgs),
     Table(TableArgs),
+    Slurm(SlurmArgs),
     Envs(EnvsArgs),
     Config(PrintArgs),
 }
@@ -312,6 +316,43 @@ pub struct TableArgs {
     pub json: bool,
 }
 
+/// Hand a sweep to Slurm: a job array with one task per run, then a job that makes the table.
+///
+/// Writes the scripts to DIR/slurm. A task that reaches its time limit writes a checkpoint and is put
+/// into the queue again; the runs that are finished are left out.
+#[derive(Debug, Args)]
+#[command(after_help = "\
+Examples:
+  cvar-game slurm --config configs/paper.toml --out /scratch/me/paper --time 2:00:00 --submit
+  cvar-game slurm --config configs/paper.toml --out sweep --array-limit 50 --extra=--mem=2G
+      then look at sweep/slurm and run sweep/slurm/submit.sh")]
+pub struct SlurmArgs {
+    /// Configuration file.
+    #[arg(long, value_name = "FILE")]
+    pub config: PathBuf,
+    /// Output folder, on a file system that all nodes share and that has locks.
+    #[arg(long, value_name = "DIR")]
+    pub out: PathBuf,
+    /// Time limit of a task, as sbatch takes it [default: the partition's].
+    #[arg(long)]
+    pub time: Option<String>,
+    /// Partition [default: the cluster's].
+    #[arg(long)]
+    pub partition: Option<String>,
+    /// Most tasks at a time [default: as many as the cluster gives].
+    #[arg(long, value_name = "N", value_parser = at_least_one)]
+    pub array_limit: Option<NonZeroUsize>,
+    /// Another option of sbatch, such as --extra=--mem=2G. May be repeated.
+    #[arg(long, value_name = "OPTION", allow_hyphen_values = true)]
+    pub extra: Vec<String>,
+    /// Submit the jobs as well.
+    #[arg(long)]
+    pub submit: bool,
+    /// Options set on the command line.
+    #[command(flatten)]
+    pub overrides: Overrides,
+}
+
 /// List the worlds with their constants.
 #[derive(Debug, Args)]
 pub struct EnvsArgs {
@@ -401,6 +442,7 @@ pub fn look(verb: LookVerb) -> Result<ExitCode> {
     match verb {
         LookVerb::Exact(args) => exact(&args),
         LookVerb::Table(args) => table(&args),
+        LookVerb::Slurm(args) => slurm(&args),
         LookVerb::Envs(args) => envs(&args),
         LookVerb::Config(args) => {
             let options = args.env.map(select).into_iter().collect();
@@ -449,6 +491,34 @@ fn table(args: &TableArgs) -> Result<ExitCode> {
     } else {
         answer::print(&report::write(&args.folder)?)
     }
+}
+
+fn slurm(args: &SlurmArgs) -> Result<ExitCode> {
+    let config = args.overrides.resolve(Some(&args.config), Vec::new())?;
+    let prepared = runner::prepare(&config, &plan::runs(&config), &args.out)?;
+    if prepared.todo.is_empty() {
+        return answer::print("all runs are finished; `cvar-game table` makes their table");
+    }
+    let runs: Vec<RunId> = prepared.todo.iter().map(RunConfig::id).collect();
+    let wishes = Wishes {
+        time: args.time.clone(),
+        partition: args.partition.clone(),
+        array_limit: args.array_limit,
+        extra: args.extra.clone(),
+    };
+    let program =
+        std::env::current_exe().context("the system does not tell this program's path")?;
+    let submit = slurm::write(&config, &runs, &args.out, &program, &wishes)
+        .with_context(|| format!("cannot write to {}", args.out.display()))?;
+    if !args.submit {
+        let (count, submit) = (runs.len(), submit.display());
+        return answer::print(&format!("{count} runs to do; submit them with: sh '{submit}'"));
+    }
+    let status = Command::new("sh").arg(&submit).status().context("cannot start sh")?;
+    if !status.success() {
+        bail!("sbatch refused the sweep; its scripts are in {}", args.out.join("slurm").display());
+    }
+    Ok(ExitCode::SUCCESS)
 }
 
 fn envs(args: &EnvsArgs) -> Result<ExitCode> {

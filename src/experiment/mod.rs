@@ -9,6 +9,7 @@
 //! | what does a run leave behind | [`artefacts`] |
 //! | what does an unfinished one go on from | [`checkpoint`] |
 //! | who may work on a run, and what stops it | [`lock`], [`stop`] |
+//! | how does a sweep go to Slurm | [`slurm`] |
 
 pub mod artefacts;
 pub mod checkpoint;
@@ -17,4 +18,5 @@ pub mod lock;
 pub mod names;
 pub mod plan;
 pub mod runner;
+pub mod slurm;
 pub mod stop;
