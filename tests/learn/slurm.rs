@@ -72,7 +72,7 @@ impl Cluster {
         // A requeued task waits until its old credential has expired, by default two minutes.
         format!(
             "ClusterName=drill\nSlurmctldHost={name}(127.0.0.1)\nSlurmUser=root\nSlurmdUser=root\n\
-             AuthType=auth/munge\nAuthInfo=socket={},cred_expire=3\nCryptoType=crypto/munge\n\
+             AuthType=auth/munge\nAuthInfo=socket={},cred_expire=5\nCryptoType=crypto/munge\n\
              ProctrackType=proctrack/linuxproc\nTaskPlugin=task/none\n\
              SelectType=select/cons_tres\nSelectTypeParameters=CR_CPU\n\
              SlurmctldPort={controller}\nSlurmdPort={node}\nReturnToService=2\nMpiDefault=none\n\
