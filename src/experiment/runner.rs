@@ -26,7 +26,7 @@ use std::sync::{Mutex, mpsc};
 use std::time::{Duration, Instant};
 use thiserror::Error;
 
-pub use super::stop::Stop;
+use super::stop::Stop;
 pub use worker::{CarryOut, InProcess, Workers, work};
 
 /// How far a run is.
