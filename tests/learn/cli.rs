@@ -192,7 +192,7 @@ mod runs {
         ";
 
     /// A run that would take hours.
-    const ENDLESS: &str = "train.steps=9_000_000_000";
+    const ENDLESS: &str = "train.steps=4_000_000_000";
 
     #[test]
     fn train_ends_with_its_summary_and_keeps_a_finished_run() {
