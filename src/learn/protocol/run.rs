@@ -1,31 +1,52 @@
 //! One run, from its configuration to its artefacts: train, keep the weights, evaluate.
+//!
+//! Training writes a checkpoint every so many updates, when it is asked to stop, and at its end. A run
+//! that was cut short goes on from the last one that is sound and ends with the same bits.
 
 use super::evaluation::{self, Yardstick};
 use super::failure::RunError;
-use crate::train::{Game, Progress, train};
+use crate::train::{Game, Progress, Training};
 use crate::weights;
-use cvar_game::experiment::artefacts::{Evaluation, Manifest, SCHEMA, write_in_place};
+use cvar_game::experiment::artefacts::{
+    BUILD, Evaluation, Manifest, SCHEMA, remove_parts, write_in_place,
+};
+use cvar_game::experiment::checkpoint::{self, Checkpoint, CheckpointError, Extent};
 use cvar_game::experiment::config::{RunConfig, WorldConfig};
-use cvar_game::experiment::runner::Tick;
+use cvar_game::experiment::lock::RunLock;
+use cvar_game::experiment::runner::{Report, Tick, read_evaluation};
+use cvar_game::experiment::stop::Stop;
 use lava_envs::{LavaGrid, LavaPoint};
-use std::fs::File;
-use std::io::{self, BufWriter, Write};
+use std::fs::{self, File, OpenOptions};
+use std::io::{self, Read, Seek, SeekFrom, Write};
 use std::path::Path;
 use std::time::Instant;
 
-/// Carries out the run and leaves its artefacts in `folder`, `evaluation.json` last.
+/// Carries out the run and leaves its artefacts in `folder`, `evaluation.json` last. Goes on from what
+/// is there of the same run.
 ///
 /// # Errors
-/// If training fails or an artefact cannot be written.
+/// If training fails or an artefact cannot be written; [`RunError::Unfinished`] if `stop` was
+/// requested or another process works on the run.
 pub fn execute(
     run: &RunConfig,
     folder: &Path,
-    report: &mut dyn FnMut(Tick),
+    stop: &Stop,
+    report: &mut dyn FnMut(Report),
 ) -> Result<(), RunError> {
     tch::set_num_threads(1);
+    let lock = RunLock::take(folder).map_err(RunError::file(folder))?;
+    let Some(_lock) = lock else { return Err(RunError::Unfinished) };
+    if matches!(read_evaluation(folder), Ok(Some(_))) {
+        return Ok(()); // another process has finished it meanwhile
+    }
+    remove_parts(folder).map_err(RunError::file(folder))?;
     match &run.env {
-        WorldConfig::LavaGrid(constants) => carry_out::<LavaGrid>(run, constants, folder, report),
-        WorldConfig::LavaPoint(constants) => carry_out::<LavaPoint>(run, constants, folder, report),
+        WorldConfig::LavaGrid(constants) => {
+            carry_out::<LavaGrid>(run, constants, folder, stop, report)
+        }
+        WorldConfig::LavaPoint(constants) => {
+            carry_out::<LavaPoint>(run, constants, folder, stop, report)
+        }
     }
 }
 
@@ -33,11 +54,9 @@ fn carry_out<W: Yardstick>(
     run: &RunConfig,
     constants: &W::Constants,
     folder: &Path,
-    report: &mut dyn FnMut(Tick),
+    stop: &Stop,
+    report: &mut dyn FnMut(Report),
 ) -> Result<(), RunError> {
-    let world = W::build(constants, run.train.parallel_episodes)?;
-    let path = folder.join("progress.csv");
-    let mut progress = ProgressFile::create(&path).map_err(RunError::file(&path))?;
     let game = Game {
         eta: run.eta,
         gamma: run.gamma,
@@ -45,41 +64,158 @@ fn carry_out<W: Yardstick>(
         device: evaluation::device(run.device),
         options: &run.train,
     };
-    let start = Instant::now();
-    let mut written = Ok(());
-    let mut last = Tick { steps: 0, mean_return: f64::NAN };
-    let trained = train::<W>(world, &game, |of| {
-        if written.is_ok() {
-            written = progress.add(of, start.elapsed().as_secs_f64());
-        }
-        last = Tick { steps: of.steps, mean_return: of.mean_return };
-        report(last);
-    });
-    let seconds = start.elapsed().as_secs_f64();
-    written.and_then(|()| progress.finish()).map_err(RunError::file(&path))?;
-
-    let mut manifest = Manifest::of(run.id(), &run.device.to_string(), last.steps, seconds);
+    let mut attempt = Attempt::<W>::begin(run, constants, &game, folder, report)?;
+    let trained = attempt.train(stop, report);
+    if matches!(trained, Err(RunError::Unfinished | RunError::File { .. })) {
+        return trained;
+    }
+    let (steps, seconds) = (attempt.steps(), attempt.seconds());
+    let mut manifest = Manifest::of(run.id(), &run.device.to_string(), steps, seconds);
     manifest.failure = trained.as_ref().err().map(ToString::to_string);
     write_json(&folder.join("manifest.json"), &manifest)?;
-    let pair = trained?;
+    trained?;
 
+    let pair = attempt.training.pair;
     let path = folder.join("final.safetensors");
-    let about = format!("schema {SCHEMA}, run {}, steps {}", manifest.run, last.steps);
+    let about = format!("schema {SCHEMA}, run {}, steps {steps}", manifest.run);
     write_in_place(&path, &weights::to_bytes(&pair, about)?).map_err(RunError::file(&path))?;
 
-    let found = evaluation::protocol(run, constants, &pair)?;
+    let found = stop.interruptible(|| evaluation::protocol(run, constants, &pair));
+    let found = found.ok_or(RunError::Unfinished)??;
     let evaluation = Evaluation {
         schema: SCHEMA,
         env: run.env.name().to_string(),
         eta: run.eta.get(),
         seed: run.seed,
-        steps: last.steps,
+        steps,
         seconds,
         plays: found.plays,
         audit: found.audit,
         certificate: found.certificate,
     };
-    write_json(&folder.join("evaluation.json"), &evaluation)
+    write_json(&folder.join("evaluation.json"), &evaluation)?;
+    checkpoint::remove(folder).map_err(RunError::file(folder))
+}
+
+/// A run being trained.
+struct Attempt<'a, W: Yardstick> {
+    run: &'a RunConfig,
+    folder: &'a Path,
+    training: Training<'a, W>,
+    progress: ProgressFile,
+    /// Seconds of training before this attempt.
+    before: f64,
+    start: Instant,
+}
+
+impl<'a, W: Yardstick> Attempt<'a, W> {
+    /// From the last sound checkpoint or, without one, from scratch.
+    fn begin(
+        run: &'a RunConfig,
+        constants: &W::Constants,
+        game: &'a Game<'a>,
+        folder: &'a Path,
+        report: &mut dyn FnMut(Report),
+    ) -> Result<Self, RunError> {
+        let fresh = || -> Result<_, RunError> {
+            Ok(Training::new(W::build(constants, run.train.parallel_episodes)?, game))
+        };
+        let start = Instant::now();
+        // They tell how an earlier attempt ended.
+        for name in ["manifest.json", "final.safetensors"] {
+            let path = folder.join(name);
+            match fs::remove_file(&path) {
+                Err(error) if error.kind() != io::ErrorKind::NotFound => {
+                    return Err(RunError::file(&path)(error));
+                }
+                _ => {}
+            }
+        }
+        for path in checkpoint::list(folder).map_err(RunError::file(folder))? {
+            let mut training = fresh()?;
+            match resume(&path, run, folder, &mut training) {
+                Ok((progress, before)) => {
+                    let update = training.updates();
+                    report(Report::Note(format!("goes on after update {update}")));
+                    return Ok(Attempt { run, folder, training, progress, before, start });
+                }
+                Err(error) => {
+                    let name = path.file_name().unwrap_or_default().to_string_lossy();
+                    report(Report::Note(format!("{name} {error}; going back before it")));
+                    fs::remove_file(&path).map_err(RunError::file(&path))?;
+                }
+            }
+        }
+        let path = folder.join(ProgressFile::NAME);
+        let progress = ProgressFile::create(&path).map_err(RunError::file(&path))?;
+        Ok(Attempt { run, folder, training: fresh()?, progress, before: 0.0, start })
+    }
+
+    /// Environment steps so far.
+    fn steps(&self) -> u64 {
+        self.training.updates() * self.run.train.rollout()
+    }
+
+    /// Seconds of training so far.
+    fn seconds(&self) -> f64 {
+        self.before + self.start.elapsed().as_secs_f64()
+    }
+
+    fn train(&mut self, stop: &Stop, report: &mut dyn FnMut(Report)) -> Result<(), RunError> {
+        let every = self.run.checkpoint.every;
+        let mut saved = self.training.updates();
+        while let Some(update) = self.training.update()? {
+            let path = self.folder.join(ProgressFile::NAME);
+            let seconds = self.seconds();
+            self.progress.add(&update, seconds).map_err(RunError::file(&path))?;
+            report(Report::Tick(Tick { steps: update.steps, mean_return: update.mean_return }));
+            let stopped = stop.signal().is_some();
+            if stopped || update.update % every == 0 {
+                self.save()?;
+                saved = update.update;
+            }
+            if stopped {
+                return Err(RunError::Unfinished);
+            }
+        }
+        // The evaluation may be cut short as well.
+        if saved < self.training.updates() { self.save() } else { Ok(()) }
+    }
+
+    fn save(&mut self) -> Result<(), RunError> {
+        let path = self.folder.join(ProgressFile::NAME);
+        let checkpoint = Checkpoint {
+            program: BUILD.to_owned(),
+            config: self.run.to_toml(),
+            seconds: self.seconds(),
+            progress: self.progress.extent().map_err(RunError::file(&path))?,
+            training: self.training.state(),
+        };
+        checkpoint::save(self.folder, self.training.updates(), &checkpoint)
+            .map_err(RunError::file(self.folder))
+    }
+}
+
+/// Brings training to where a checkpoint was written; the file of its progress, and the seconds that
+/// it took.
+fn resume<W: Yardstick>(
+    path: &Path,
+    run: &RunConfig,
+    folder: &Path,
+    training: &mut Training<'_, W>,
+) -> Result<(ProgressFile, f64), CheckpointError> {
+    let unfit = |reason: &str| CheckpointError::Unfit(reason.to_owned());
+    let checkpoint: Checkpoint<_> = checkpoint::load(path)?;
+    if checkpoint.config != run.to_toml() {
+        return Err(unfit("it is of another configuration"));
+    }
+    if checkpoint.program != BUILD {
+        return Err(unfit("it is of another version of the program"));
+    }
+    training.restore(checkpoint.training).map_err(|error| unfit(&error.to_string()))?;
+    let progress = ProgressFile::resume(&folder.join(ProgressFile::NAME), checkpoint.progress)
+        .map_err(|error| CheckpointError::Unfit(format!("{}: {error}", ProgressFile::NAME)))?;
+    Ok((progress, checkpoint.seconds))
 }
 
 fn write_json(path: &Path, value: &impl serde::Serialize) -> Result<(), RunError> {
@@ -91,9 +227,11 @@ fn write_json(path: &Path, value: &impl serde::Serialize) -> Result<(), RunError
 
 /// `progress.csv`: a line per update. `seconds` is the only column that differs between two runs of
 /// one seed.
-struct ProgressFile(csv::Writer<BufWriter<File>>);
+struct ProgressFile(csv::Writer<Counted>);
 
 impl ProgressFile {
+    const NAME: &'static str = "progress.csv";
+
     const COLUMNS: [&'static str; 18] = [
         "update",
         "steps",
@@ -116,9 +254,31 @@ impl ProgressFile {
     ];
 
     fn create(path: &Path) -> io::Result<Self> {
-        let mut writer = csv::Writer::from_writer(BufWriter::new(File::create(path)?));
+        let mut writer = csv::Writer::from_writer(Counted::new(File::create(path)?));
         writer.write_record(Self::COLUMNS)?;
         Ok(ProgressFile(writer))
+    }
+
+    /// Goes on behind `extent`; what follows it is cut off.
+    fn resume(path: &Path, extent: Extent) -> io::Result<Self> {
+        let mut file = OpenOptions::new().read(true).write(true).open(path)?;
+        let mut counted = Counted::new(file.try_clone()?);
+        let mut head = (&mut file).take(extent.bytes);
+        io::copy(&mut head, &mut counted.seen)?;
+        if counted.seen.extent() != extent {
+            return Err(io::Error::new(io::ErrorKind::InvalidData, "its lines have changed"));
+        }
+        file.set_len(extent.bytes)?;
+        file.seek(SeekFrom::End(0))?;
+        Ok(ProgressFile(csv::Writer::from_writer(counted)))
+    }
+
+    /// What was written so far, which is on the disk then.
+    fn extent(&mut self) -> io::Result<Extent> {
+        self.0.flush()?;
+        let counted = self.0.get_ref();
+        counted.file.sync_data()?;
+        Ok(counted.seen.extent())
     }
 
     fn add(&mut self, of: &Progress, seconds: f64) -> io::Result<()> {
@@ -143,8 +303,52 @@ impl ProgressFile {
         let record = head.into_iter().chain(numbers.map(|x| format!("{x:.6}"))).chain(timing);
         Ok(self.0.write_record(record)?)
     }
+}
 
-    fn finish(self) -> io::Result<()> {
-        self.0.into_inner().map_err(|error| io::Error::other(error.to_string()))?.flush()
+/// A file that knows its checksum. The writer above has a buffer.
+struct Counted {
+    file: File,
+    seen: Seen,
+}
+
+impl Counted {
+    fn new(file: File) -> Self {
+        Counted { file, seen: Seen::default() }
+    }
+}
+
+impl Write for Counted {
+    fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
+        let count = self.file.write(bytes)?;
+        self.seen.write(&bytes[..count])
+    }
+
+    fn flush(&mut self) -> io::Result<()> {
+        self.file.flush()
+    }
+}
+
+/// Length and checksum of what was written.
+#[derive(Debug, Clone, Default)]
+struct Seen {
+    bytes: u64,
+    crc: crc32fast::Hasher,
+}
+
+impl Seen {
+    fn extent(&self) -> Extent {
+        Extent { bytes: self.bytes, crc: self.crc.clone().finalize() }
+    }
+}
+
+impl Write for Seen {
+    fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
+        self.bytes += bytes.len() as u64;
+        self.crc.update(bytes);
+        Ok(bytes.len())
+    }
+
+    fn flush(&mut self) -> io::Result<()> {
+        Ok(())
     }
 }
