@@ -3,16 +3,21 @@
 //! There are two programs: `cvar-game`, which is not linked to libtorch, and `cvar-game-torch` (crate
 //! `cvar-learn`), to which it hands over what needs the networks.
 //!
-//! Exit codes: 0 done, 1 a run failed, 2 bad input or usage, 130 and 143 stopped by SIGINT and SIGTERM.
+//! Exit codes: 0 done, 1 a run failed, 2 bad input or usage, 75 stopped by SIGTERM and 130 by SIGINT,
+//! with checkpoints written: the same command goes on.
 //! Answers go to standard output, progress and errors to standard error.
 
 pub mod answer;
 
 use crate::exact::oracle;
+use crate::experiment::artefacts::BUILD;
 use crate::experiment::config::{
-    Config, ConfigError, Device, Setting, WorldConfig, default_constants,
+    Config, ConfigError, Device, RunConfig, Setting, WorldConfig, default_constants,
 };
-use crate::experiment::names::WorldName;
+use crate::experiment::names::{RunId, WorldName};
+use crate::experiment::plan;
+use crate::experiment::runner;
+use crate::experiment::slurm::{self, Wishes};
 use crate::game::budget::Eta;
 use crate::{exact, report};
 use anyhow::{Context, Result, bail};
@@ -37,7 +42,11 @@ Examples:
   cvar-game exact --env lava-grid --eta 25
       the best CVaR_0.04 there is on the grid
   cvar-game config --set env.slip=0.1
-      what a configuration comes to; all options are explained in configs/default.toml"
+      what a configuration comes to; all options are explained in configs/default.toml
+
+Exit codes:
+  0 done, 1 a run failed, 2 bad input or usage;
+  75 stopped by SIGTERM, 130 by Ctrl-C: the same command goes on where it was"
 )]
 pub struct Cli {
     #[command(subcommand)]
@@ -81,6 +90,7 @@ pub enum LookVerb {
     Table(TableArgs),
     Figures(FiguresArgs),
     Report(ReportArgs),
+    Slurm(SlurmArgs),
     Envs(EnvsArgs),
     Config(PrintArgs),
 }
@@ -114,13 +124,16 @@ impl Overrides {
 
 /// Train and evaluate every run of a configuration, then print the table of results.
 ///
-/// Finished runs are kept: the same command goes on where it was stopped.
+/// Finished runs are kept and unfinished ones go on from their last checkpoint: the same command goes
+/// on where it was stopped, with the same results. Several may work on one folder at once, on one
+/// machine or many: no run is done twice.
 #[derive(Debug, Args)]
 #[command(after_help = "\
 Examples:
   cvar-game bench --config configs/quick.toml
   cvar-game bench --config configs/paper.toml --out results/slippery --set env.slip=0.1
-  cvar-game bench --config configs/quick.toml --jobs 1 --set 'experiment.seeds=[1]' --out /tmp/try")]
+  cvar-game bench --config configs/quick.toml --jobs 1 --set 'experiment.seeds=[1]' --out /tmp/try
+  cvar-game bench --config configs/paper.toml --only lava-grid/eta-25/seed-3")]
 pub struct BenchArgs {
     /// Configuration file.
     #[arg(long, value_name = "FILE")]
@@ -131,6 +144,9 @@ pub struct BenchArgs {
     /// Runs at the same time, one thread each [default: the processor's cores].
     #[arg(long, value_name = "N", value_parser = at_least_one)]
     pub jobs: Option<NonZeroUsize>,
+    /// This run of the configuration alone, and no table: for schedulers, one task per run.
+    #[arg(long, value_name = "RUN_ID")]
+    pub only: Option<RunId>,
     /// Device of the networks: cpu, cuda or cuda:N.
     #[arg(long)]
     pub device: Option<Device>,
@@ -327,6 +343,43 @@ pub struct ReportArgs {
     pub folder: PathBuf,
 }
 
+/// Hand a sweep to Slurm: a job array with one task per run, then a job that makes the table.
+///
+/// Writes the scripts to DIR/slurm. A task that reaches its time limit writes a checkpoint and is put
+/// into the queue again; the runs that are finished are left out.
+#[derive(Debug, Args)]
+#[command(after_help = "\
+Examples:
+  cvar-game slurm --config configs/paper.toml --out /scratch/me/paper --time 2:00:00 --submit
+  cvar-game slurm --config configs/paper.toml --out sweep --array-limit 50 --extra=--mem=2G
+      then look at sweep/slurm and run sweep/slurm/submit.sh")]
+pub struct SlurmArgs {
+    /// Configuration file.
+    #[arg(long, value_name = "FILE")]
+    pub config: PathBuf,
+    /// Output folder, on a file system that all nodes share and that has locks.
+    #[arg(long, value_name = "DIR")]
+    pub out: PathBuf,
+    /// Time limit of a task, as sbatch takes it [default: the partition's].
+    #[arg(long)]
+    pub time: Option<String>,
+    /// Partition [default: the cluster's].
+    #[arg(long)]
+    pub partition: Option<String>,
+    /// Most tasks at a time [default: as many as the cluster gives].
+    #[arg(long, value_name = "N", value_parser = at_least_one)]
+    pub array_limit: Option<NonZeroUsize>,
+    /// Another option of sbatch, such as --extra=--mem=2G. May be repeated.
+    #[arg(long, value_name = "OPTION", allow_hyphen_values = true)]
+    pub extra: Vec<String>,
+    /// Submit the jobs as well.
+    #[arg(long)]
+    pub submit: bool,
+    /// Options set on the command line.
+    #[command(flatten)]
+    pub overrides: Overrides,
+}
+
 /// List the worlds with their constants.
 #[derive(Debug, Args)]
 pub struct EnvsArgs {
@@ -371,8 +424,6 @@ pub fn run(cli: Cli) -> Result<ExitCode> {
 
 /// The program that plays, beside this one.
 const PLAYER: &str = "cvar-game-torch";
-/// What both programs were built from.
-const BUILD: &str = env!("CVAR_GAME_BUILD");
 /// How the one tells it to the other.
 const BUILD_VARIABLE: &str = "CVAR_GAME_BUILD";
 
@@ -420,6 +471,7 @@ pub fn look(verb: LookVerb) -> Result<ExitCode> {
         LookVerb::Table(args) => table(&args),
         LookVerb::Figures(args) => figures(&args),
         LookVerb::Report(args) => report(&args.folder),
+        LookVerb::Slurm(args) => slurm(&args),
         LookVerb::Envs(args) => envs(&args),
         LookVerb::Config(args) => {
             let options = args.env.map(select).into_iter().collect();
@@ -494,6 +546,34 @@ fn tell_missing(figures: &report::figures::Figures) {
     if !figures.missing.is_empty() {
         eprintln!("left out, for want of artefacts: {}", figures.missing.join("; "));
     }
+}
+
+fn slurm(args: &SlurmArgs) -> Result<ExitCode> {
+    let config = args.overrides.resolve(Some(&args.config), Vec::new())?;
+    let prepared = runner::prepare(&config, &plan::runs(&config), &args.out)?;
+    if prepared.todo.is_empty() {
+        return answer::print("all runs are finished; `cvar-game table` makes their table");
+    }
+    let runs: Vec<RunId> = prepared.todo.iter().map(RunConfig::id).collect();
+    let wishes = Wishes {
+        time: args.time.clone(),
+        partition: args.partition.clone(),
+        array_limit: args.array_limit,
+        extra: args.extra.clone(),
+    };
+    let program =
+        std::env::current_exe().context("the system does not tell this program's path")?;
+    let submit = slurm::write(&config, &runs, &args.out, &program, &wishes)
+        .with_context(|| format!("cannot write to {}", args.out.display()))?;
+    if !args.submit {
+        let (count, submit) = (runs.len(), submit.display());
+        return answer::print(&format!("{count} runs to do; submit them with: sh '{submit}'"));
+    }
+    let status = Command::new("sh").arg(&submit).status().context("cannot start sh")?;
+    if !status.success() {
+        bail!("sbatch refused the sweep; its scripts are in {}", args.out.join("slurm").display());
+    }
+    Ok(ExitCode::SUCCESS)
 }
 
 fn envs(args: &EnvsArgs) -> Result<ExitCode> {

@@ -263,3 +263,18 @@ fn a_small_ratio_raises_the_budget() {
     assert_eq!(budget(4.0).spend(0.5).get(), 8.0);
     assert_eq!(budget(4.0).spend(4.0).get(), 1.0);
 }
+
+/// Far from a narrow bump delta^0 rounds to 0, and with that ratio no budget could be spent.
+#[test]
+fn a_ratio_that_rounds_to_zero_leaves_a_finite_budget() {
+    // c and K at their bounds along x, and budget enough for the bump alone.
+    let perturbation = FAMILY.perturbation(&[1e6, 0.0, 1e6, 0.0, 0.0], &GaussianLaw, budget(1e6));
+    assert_eq!(perturbation.weight(), 1.0);
+    let ratio = perturbation.likelihood_ratio(Vector2::new(-3.0, 0.0));
+    assert!(ratio > 0.0 && ratio < 1e-300, "{ratio}");
+    let mut left = budget(1e6);
+    for _ in 0..40 {
+        left = left.spend(ratio);
+        assert!(left.get().is_finite());
+    }
+}

@@ -23,8 +23,7 @@ fn results(dir: &Path) {
         let folder = id.folder(dir);
         fs::create_dir_all(&folder).unwrap();
         fs::write(folder.join("config.toml"), config.run(id).to_toml()).unwrap();
-        let progress =
-            "steps,player,mean_return,budget\n10000,protagonist,-1.5,1\n20000,antagonist,0.25,1\n";
+        let progress = "steps,player,mean_return,regret\n10000,protagonist,-1.5,1.5\n20000,antagonist,0.25,0.25\n";
         fs::write(folder.join("progress.csv"), progress).unwrap();
         let law = || {
             ReturnLaw::recorded((0..1000).map(|episode| Atom {
@@ -101,7 +100,6 @@ fn exhibits(env: &str, neutral: bool) -> Exhibits {
             high: vec![1.0, 0.8],
         }),
         stored: kinds.into_iter().map(stored).collect(),
-        regret: if env == "lava-grid" { vec![(10_000, 1.5), (20_000, 0.25)] } else { Vec::new() },
     }
 }
 
@@ -184,6 +182,7 @@ fn runs_without_exhibits_report_all_the_same() {
         [
             "lava-grid-map",
             "lava-grid-frontier",
+            "lava-grid-regret",
             "lava-grid-cross",
             "lava-grid-learning",
             "lava-point-frontier",
@@ -193,6 +192,28 @@ fn runs_without_exhibits_report_all_the_same() {
     assert!(written.figures.missing.contains(&"lava-grid: where chance is bent".to_owned()));
     let page = fs::read_to_string(dir.path().join("report.html")).unwrap();
     assert!(page.contains("No episodes were stored.") && page.contains("Left out"), "{page}");
+}
+
+#[test]
+fn damaged_exhibits_are_named() {
+    for (spoil, said) in
+        [("divergence", "maps are of unequal size"), ("ratios", "episode lacks a part")]
+    {
+        let dir = tempfile::tempdir().unwrap();
+        results(dir.path());
+        let path = dir.path().join("lava-point/eta-25/seed-2/exhibits.json");
+        let mut value: serde_json::Value =
+            serde_json::from_slice(&fs::read(&path).unwrap()).unwrap();
+        let list = match spoil {
+            "divergence" => &mut value["world"]["lava-point"]["shifts"][1][spoil],
+            _ => &mut value["stored"][0][spoil],
+        };
+        list.as_array_mut().unwrap().pop();
+        fs::write(&path, value.to_string()).unwrap();
+        let error = report::write_all(dir.path()).unwrap_err().to_string();
+        assert!(error.contains("seed-2/exhibits.json") && error.contains(said), "{error}");
+        assert!(!dir.path().join("report.html").exists());
+    }
 }
 
 /// In headless Chromium, at a desk's and a phone's width: no error, tables sort, the player advances

@@ -3,15 +3,18 @@
 
 use cvar_game::experiment::artefacts::{Evaluation, Manifest, SCHEMA};
 use cvar_game::experiment::config::{Config, RunConfig, Setting};
+use cvar_game::experiment::lock::RunLock;
+use cvar_game::experiment::plan;
 use cvar_game::experiment::runner::{
-    self, Event, Failure, Launcher, Outcome, Stop, Tick, Workers, prepare,
+    self, Event, Failure, Launcher, Outcome, Prepared, Report, RunnerError, Tick, Workers,
 };
+use cvar_game::experiment::stop::Stop;
 use std::collections::BTreeMap;
 use std::fs;
 use std::num::NonZeroUsize;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicUsize, Ordering};
-use std::sync::{Barrier, OnceLock};
+use std::sync::{Barrier, Mutex, OnceLock};
 use std::time::{Duration, Instant};
 
 /// A sweep over one world at eta 1 with these seeds.
@@ -26,6 +29,10 @@ fn config_with(seeds: &[u64], sets: &[&str]) -> Config {
     let settings: Vec<Setting> =
         settings.into_iter().map(|set| Setting::parse(set).unwrap()).collect();
     Config::resolve(None, &settings).unwrap()
+}
+
+fn prepare(config: &Config, out: &Path) -> Result<Prepared, RunnerError> {
+    runner::prepare(config, &plan::runs(config), out)
 }
 
 fn run_folder(out: &Path, seed: u64) -> PathBuf {
@@ -45,6 +52,7 @@ fn sweep(
         told.push(match event {
             Event::Started { run, .. } => format!("{} started", run.seed),
             Event::Ticked { run, tick } => format!("{} at {}", run.seed, tick.steps),
+            Event::Noted { run, note } => format!("{} noted: {note}", run.seed),
             Event::Finished { run, .. } => format!("{} finished", run.seed),
             Event::Failed { run, reason, .. } => format!("{} failed: {reason}", run.seed),
             Event::Stopped { run } => format!("{} stopped", run.seed),
@@ -81,10 +89,10 @@ impl<F: Fn(u64, &Path, &Stop) -> Result<(), Failure> + Sync> Launcher for Mock<F
         run: &RunConfig,
         folder: &Path,
         stop: &Stop,
-        tick: &mut dyn FnMut(Tick),
+        report: &mut dyn FnMut(Report),
     ) -> Result<(), Failure> {
         assert_eq!(RunConfig::load(&folder.join("config.toml")).unwrap(), *run);
-        tick(Tick { steps: 10, mean_return: f64::NAN });
+        report(Report::Tick(Tick { steps: 10, mean_return: f64::NAN }));
         (self.0)(run.seed, folder, stop)?;
         finish(run, folder);
         Ok(())
@@ -179,7 +187,7 @@ fn a_run_without_an_evaluation_has_failed() {
             _: &RunConfig,
             _: &Path,
             _: &Stop,
-            _: &mut dyn FnMut(Tick),
+            _: &mut dyn FnMut(Report),
         ) -> Result<(), Failure> {
             Ok(())
         }
@@ -190,7 +198,21 @@ fn a_run_without_an_evaluation_has_failed() {
 }
 
 #[test]
-fn finished_runs_are_kept_and_unfinished_ones_start_from_scratch() {
+fn a_run_with_an_evaluation_is_finished_however_its_process_ended() {
+    let out = tempfile::tempdir().unwrap();
+    let config = config(&[1]);
+    let run = config.run(plan::runs(&config)[0]);
+    let mock = Mock(|_, folder: &Path, _: &Stop| {
+        finish(&run, folder);
+        Err(Failure::Failed("killed in its last moment".into()))
+    });
+    let (outcome, _) = sweep(&config, out.path(), 1, &mock, &Stop::default());
+    assert_eq!((outcome.finished, outcome.failed.len()), (1, 0));
+    assert!(!run_folder(out.path(), 1).join("manifest.json").exists());
+}
+
+#[test]
+fn finished_runs_are_kept_and_unfinished_ones_are_launched_again() {
     let out = tempfile::tempdir().unwrap();
     let half = Mock(|seed, folder: &Path, _: &Stop| {
         fs::write(folder.join("progress.csv"), "old").unwrap();
@@ -200,7 +222,8 @@ fn finished_runs_are_kept_and_unfinished_ones_start_from_scratch() {
     let before = files(&run_folder(out.path(), 1));
     let again = Mock(|seed, folder: &Path, _: &Stop| {
         assert_eq!(seed, 2);
-        assert!(!folder.join("progress.csv").exists() && !folder.join("manifest.json").exists());
+        // What there is to go on from is the launcher's business.
+        assert_eq!(fs::read_to_string(folder.join("progress.csv")).unwrap(), "old");
         Ok(())
     });
     let prepared = prepare(&config(&[1, 2]), out.path()).unwrap();
@@ -218,7 +241,7 @@ fn a_stopped_sweep_starts_nothing_more_and_keeps_what_is_finished() {
     let mock = Mock(|seed, _: &Path, stop: &Stop| {
         if seed == 2 {
             stop.request(15);
-            return Err(Failure::Stopped);
+            return Err(Failure::Unfinished);
         }
         assert_eq!(seed, 1);
         Ok(())
@@ -294,13 +317,84 @@ fn an_output_folder_that_cannot_be_written_is_refused() {
 }
 
 #[test]
-fn two_sweeps_never_share_a_folder() {
+fn a_run_that_another_process_works_on_is_left_alone_until_it_is_free() {
     let out = tempfile::tempdir().unwrap();
-    let first = prepare(&config(&[1]), out.path()).unwrap();
-    let message = prepare(&config(&[1]), out.path()).unwrap_err().to_string();
-    assert!(message.starts_with("another cvar-game is writing to "), "{message}");
-    drop(first);
-    prepare(&config(&[1]), out.path()).unwrap();
+    let busy = run_folder(out.path(), 1);
+    fs::create_dir_all(&busy).unwrap();
+    let lock = Mutex::new(RunLock::take(&busy).unwrap());
+    let launched = Mutex::new(Vec::new());
+    let mock = Mock(|seed, _: &Path, _: &Stop| {
+        launched.lock().unwrap().push(seed);
+        if seed == 3 {
+            lock.lock().unwrap().take(); // the other process dies
+        }
+        Ok(())
+    });
+    let (outcome, told) = sweep(&config(&[1, 2, 3]), out.path(), 1, &mock, &Stop::default());
+    assert_eq!(outcome.finished, 3);
+    assert_eq!(launched.into_inner().unwrap(), [2, 3, 1]);
+    assert_eq!(told.iter().filter(|event| event.ends_with("started")).count(), 3, "{told:?}");
+}
+
+#[test]
+fn a_run_that_another_process_finishes_meanwhile_is_not_done_again() {
+    let out = tempfile::tempdir().unwrap();
+    let config = config(&[1, 2]);
+    let other = config.run(plan::runs(&config)[1]);
+    let mock = Mock(|seed, _: &Path, _: &Stop| {
+        assert_eq!(seed, 1);
+        let folder = run_folder(out.path(), 2);
+        fs::create_dir_all(&folder).unwrap();
+        fs::write(folder.join("config.toml"), other.to_toml()).unwrap();
+        finish(&other, &folder);
+        Ok(())
+    });
+    let (outcome, told) = sweep(&config, out.path(), 1, &mock, &Stop::default());
+    assert_eq!(outcome.finished, 2);
+    assert!(!told.contains(&"2 started".to_owned()), "{told:?}");
+}
+
+#[test]
+fn two_sweeps_at_once_do_every_run_once() {
+    let out = tempfile::tempdir().unwrap();
+    let launched = Mutex::new(Vec::new());
+    // As a worker does.
+    let mock = Mock(|seed, folder: &Path, _: &Stop| {
+        let Some(_lock) = RunLock::take(folder).unwrap() else { return Err(Failure::Unfinished) };
+        if folder.join("evaluation.json").exists() {
+            return Ok(());
+        }
+        launched.lock().unwrap().push(seed);
+        std::thread::sleep(Duration::from_millis(20));
+        fs::write(folder.join("done"), "").unwrap();
+        let run = RunConfig::load(&folder.join("config.toml")).unwrap();
+        finish(&run, folder);
+        Ok(())
+    });
+    let config = config(&[1, 2, 3, 4, 5, 6]);
+    std::thread::scope(|scope| {
+        for _ in 0..2 {
+            scope.spawn(|| {
+                let (outcome, _) = sweep(&config, out.path(), 2, &mock, &Stop::default());
+                assert_eq!(outcome.failed, []);
+            });
+        }
+    });
+    let mut launched = launched.into_inner().unwrap();
+    launched.sort();
+    assert_eq!(launched, [1, 2, 3, 4, 5, 6]);
+}
+
+#[test]
+fn what_a_killed_process_leaves_at_its_start_does_not_block_the_run() {
+    let out = tempfile::tempdir().unwrap();
+    let folder = run_folder(out.path(), 1);
+    fs::create_dir_all(&folder).unwrap();
+    for name in [".lock", ".part-Xy12"] {
+        fs::write(folder.join(name), "").unwrap();
+    }
+    let (outcome, _) = sweep(&config(&[1]), out.path(), 1, &Mock(succeed), &Stop::default());
+    assert_eq!(outcome.finished, 1);
 }
 
 /// A worker that does what its run's seed says.
@@ -311,6 +405,7 @@ case $(grep -m 1 '^seed' "$folder/config.toml") in
 "seed = 1")
     echo '{"steps":20,"mean_return":null}'
     echo 'chatter of a library'
+    echo '{"note":"goes on after update 7"}'
     echo '{"schema":1,"env":"lava-grid","eta":1.0,"seed":1,"steps":20,"seconds":1.0,"plays":[]}' \
         > "$folder/evaluation.json" ;;
 "seed = 2") echo '{"failure":"NaN in update 7"}'; exit 1 ;;
@@ -318,7 +413,11 @@ case $(grep -m 1 '^seed' "$folder/config.toml") in
     printf 'thread main panicked at src/x.rs:1:1:\nindex out of bounds\nnote: backtrace\n' >&2
     exit 101 ;;
 "seed = 4") kill -9 $$ ;;
-"seed = 5") echo $$ > "$folder/pid"; exec sleep 600 ;;
+"seed = 5") echo $$ > "$folder/pid"; cat; exit 75 ;;
+"seed = 6") echo $$ > "$folder/pid"; exec sleep 600 ;;
+"seed = 7") if ! [ -e "$folder/pid" ]; then echo $$ > "$folder/pid"; exit 75; fi
+    echo '{"schema":1,"env":"lava-grid","eta":1.0,"seed":7,"steps":20,"seconds":1.0,"plays":[]}' \
+        > "$folder/evaluation.json" ;;
 esac
 "#;
     static SCRIPT: OnceLock<tempfile::TempDir> = OnceLock::new();
@@ -338,7 +437,8 @@ fn what_workers_report_and_how_they_die_is_told() {
     let out = tempfile::tempdir().unwrap();
     let (outcome, told) = sweep(&config(&[1, 2, 3, 4]), out.path(), 1, &script(), &Stop::default());
     assert_eq!(outcome.finished, 1, "{outcome:?}");
-    assert_eq!(told[..3], ["1 started", "1 at 20", "1 finished"]);
+    let note = "1 noted: goes on after update 7";
+    assert_eq!(told[..4], ["1 started", "1 at 20", note, "1 finished"]);
     let reasons: Vec<&str> = outcome.failed.iter().map(|(_, reason)| reason.as_str()).collect();
     assert_eq!(reasons[0], "NaN in update 7");
     assert!(reasons[1].contains("exit status: 101) and said: index out of bounds; see "));
@@ -347,23 +447,42 @@ fn what_workers_report_and_how_they_die_is_told() {
     assert!(run_folder(out.path(), 3).join("worker.log").exists());
 }
 
-#[test]
-fn a_stopped_worker_is_ended_and_reaped() {
+/// Stops a sweep of one run as soon as its worker has started.
+fn stop_a_worker(seed: u64, workers: &Workers) -> Vec<String> {
     let out = tempfile::tempdir().unwrap();
     let stop = Stop::default();
-    let pid = run_folder(out.path(), 5).join("pid");
+    let pid = run_folder(out.path(), seed).join("pid");
     let start = Instant::now();
     let (outcome, told) = std::thread::scope(|scope| {
-        let sweeping = scope.spawn(|| sweep(&config(&[5, 1]), out.path(), 1, &script(), &stop));
+        let sweeping = scope.spawn(|| sweep(&config(&[seed, 1]), out.path(), 1, workers, &stop));
         while fs::read_to_string(&pid).unwrap_or_default().is_empty() {
             std::thread::sleep(Duration::from_millis(5));
             assert!(start.elapsed() < Duration::from_secs(60), "the worker did not start");
         }
-        stop.request(2);
+        stop.request(15);
         sweeping.join().unwrap()
     });
-    assert_eq!((outcome.stopped, outcome.finished), (Some(2), 0));
-    assert_eq!(told, ["5 started", "5 stopped"]);
+    assert_eq!((outcome.stopped, outcome.finished), (Some(15), 0));
     let pid = fs::read_to_string(pid).unwrap();
     assert!(!Path::new("/proc").join(pid.trim()).exists(), "the worker is still there");
+    told
+}
+
+#[test]
+fn a_stopped_worker_is_asked_to_end_and_reaped() {
+    assert_eq!(stop_a_worker(5, &script()), ["5 started", "5 stopped"]);
+}
+
+#[test]
+fn a_worker_that_does_not_stop_is_killed() {
+    let workers = script().with_patience(Duration::from_millis(100));
+    assert_eq!(stop_a_worker(6, &workers), ["6 started", "6 stopped"]);
+}
+
+#[test]
+fn a_worker_that_was_stopped_from_elsewhere_is_started_again() {
+    let out = tempfile::tempdir().unwrap();
+    let (outcome, told) = sweep(&config(&[7]), out.path(), 1, &script(), &Stop::default());
+    assert_eq!(outcome.finished, 1, "{told:?}");
+    assert_eq!(told, ["7 started", "7 started", "7 finished"]);
 }

@@ -1,4 +1,4 @@
-//! What can be wrong with the configuration of a world.
+//! What can be wrong with what a world is given: its configuration, and states to go on from.
 
 use thiserror::Error;
 
@@ -27,6 +27,17 @@ pub enum ConfigError {
         /// What to do.
         remedy: String,
     },
+}
+
+/// A snapshot that is no state of the world.
+#[derive(Debug, Clone, PartialEq, Eq, Error)]
+#[error("the world has no state {0}")]
+pub struct NoSuchState(pub String);
+
+impl NoSuchState {
+    pub(crate) fn of(snapshot: &impl std::fmt::Debug) -> Self {
+        NoSuchState(format!("{snapshot:?}"))
+    }
 }
 
 impl ConfigError {

@@ -10,7 +10,7 @@
 //! Source: the gridworld of "A Game-Theoretic Perspective on Risk-Sensitive Reinforcement Learning"
 //! (arXiv 2109.09470).
 
-use crate::error::{ConfigError, require};
+use crate::error::{ConfigError, NoSuchState, require};
 use crate::law::{FiniteLaw, MOVES};
 use crate::map::{Map, Tile};
 use crate::world::{End, Step, World};
@@ -118,8 +118,9 @@ impl Move {
     }
 }
 
-#[derive(Debug, Clone, Copy, PartialEq)]
-struct Episode {
+/// State of an episode.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Episode {
     cell: usize,
     time: u32,
     ended: bool,
@@ -300,6 +301,7 @@ fn clearance(map: &Map) -> Vec<f64> {
 impl World for LavaGrid {
     type Action = Move;
     type Law = FiniteLaw;
+    type Snapshot = Episode;
 
     /// (x, y), each mapped from its first to its last cell onto [-1, 1].
     const OBSERVATION: usize = 2;
@@ -316,6 +318,21 @@ impl World for LavaGrid {
 
     fn reset(&mut self, slot: usize) {
         self.episodes[slot] = Episode { cell: self.map.start(), time: 0, ended: false };
+    }
+
+    fn snapshot(&self, slot: usize) -> Episode {
+        self.episodes[slot]
+    }
+
+    fn restore(&mut self, slot: usize, snapshot: Episode) -> Result<(), NoSuchState> {
+        let Episode { cell, time, ended } = snapshot;
+        let enterable = cell < self.cells() && !self.is_wall(cell);
+        // A running episode has time left.
+        if !enterable || time > self.config.horizon - u32::from(!ended) {
+            return Err(NoSuchState::of(&snapshot));
+        }
+        self.episodes[slot] = snapshot;
+        Ok(())
     }
 
     fn time(&self, slot: usize) -> u32 {

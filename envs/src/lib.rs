@@ -13,7 +13,7 @@ pub mod point;
 pub mod random;
 pub mod world;
 
-pub use error::ConfigError;
+pub use error::{ConfigError, NoSuchState};
 pub use grid::{GridConfig, LavaGrid, Move};
 pub use law::{FiniteLaw, GaussianLaw, Law};
 pub use point::{Force, LavaPoint, PointConfig};

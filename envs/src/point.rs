@@ -20,13 +20,14 @@ pub mod physics;
 
 pub use config::{PointConfig, Rectangle};
 
-use crate::error::ConfigError;
+use crate::error::{ConfigError, NoSuchState};
 use crate::law::GaussianLaw;
 use crate::world::{End, Step, World};
 use geometry::Scene;
 use nalgebra::Vector2;
 use physics::{Body, Physics};
 use rapier2d::math::Vector;
+use serde::{Deserialize, Serialize};
 
 /// Speed that the observation maps onto 1 (m/s).
 pub const OBSERVED_SPEED: f64 = 4.0;
@@ -44,10 +45,18 @@ impl Force {
     }
 }
 
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 struct Clock {
     time: u32,
     ended: bool,
+}
+
+/// State of an episode. Rapier keeps nothing of a disc from step to step, see [`physics`].
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct Snapshot {
+    position: [f32; 2],
+    velocity: [f32; 2],
+    clock: Clock,
 }
 
 /// A batch of episodes of `lava-point`.
@@ -142,6 +151,7 @@ fn floats(vector: Vector) -> [f64; 2] {
 impl World for LavaPoint {
     type Action = Force;
     type Law = GaussianLaw;
+    type Snapshot = Snapshot;
 
     /// Position, mapped from the arena onto [-1, 1]^2, and velocity in units of [`OBSERVED_SPEED`].
     const OBSERVATION: usize = 4;
@@ -160,6 +170,29 @@ impl World for LavaPoint {
     fn reset(&mut self, slot: usize) {
         self.bodies[slot] = Body { position: vector(self.config.start), velocity: Vector::ZERO };
         self.clocks[slot] = Clock { time: 0, ended: false };
+    }
+
+    fn snapshot(&self, slot: usize) -> Snapshot {
+        let Body { position, velocity } = self.bodies[slot];
+        let [position, velocity] = [position.to_array(), velocity.to_array()];
+        Snapshot { position, velocity, clock: self.clocks[slot] }
+    }
+
+    fn restore(&mut self, slot: usize, snapshot: Snapshot) -> Result<(), NoSuchState> {
+        let Snapshot { position, velocity, clock } = snapshot;
+        // Wide enough for rounding at walls and at the speed limit. No comparison holds for a NaN.
+        let fastest = 2.0 * physics::speed_limit(&self.config) as f32;
+        let possible = (0..2).all(|axis| {
+            (0.0..=self.config.arena[axis] as f32).contains(&position[axis])
+                && velocity[axis].abs() <= fastest
+        });
+        // A running episode has time left.
+        if !possible || clock.time > self.config.horizon - u32::from(!clock.ended) {
+            return Err(NoSuchState::of(&snapshot));
+        }
+        self.bodies[slot] = Body { position: position.into(), velocity: velocity.into() };
+        self.clocks[slot] = clock;
+        Ok(())
     }
 
     fn time(&self, slot: usize) -> u32 {

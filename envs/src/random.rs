@@ -31,3 +31,15 @@ pub fn stream(seed: u64, purpose: Purpose, index: u64) -> ChaCha8Rng {
     random.set_stream(((purpose as u64) << 56) | index);
     random
 }
+
+/// [`stream`] from a position on, as [`position`] told it.
+pub fn stream_from(seed: u64, purpose: Purpose, index: u64, position: u128) -> ChaCha8Rng {
+    let mut random = stream(seed, purpose, index);
+    random.set_word_pos(position);
+    random
+}
+
+/// How far a stream was read, in 32-bit words.
+pub fn position(random: &ChaCha8Rng) -> u128 {
+    random.get_word_pos()
+}

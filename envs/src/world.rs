@@ -1,6 +1,8 @@
 //! What every world offers: a batch of independent episodes, stepped together.
 
+use crate::error::NoSuchState;
 use crate::law::Law;
+use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 
 /// How an episode ended.
@@ -39,6 +41,8 @@ pub trait World {
     type Action: Copy + std::fmt::Debug + PartialEq + Send + Sync;
     /// The nominal law of what chance decides.
     type Law: Law;
+    /// All that the next steps of a slot's episode depend on.
+    type Snapshot: Copy + std::fmt::Debug + PartialEq + Serialize + DeserializeOwned;
 
     /// Length of [`World::observe`]'s vector.
     const OBSERVATION: usize;
@@ -53,6 +57,16 @@ pub trait World {
 
     /// Puts the slot back to the initial state, at time 0.
     fn reset(&mut self, slot: usize);
+
+    /// The state of the slot's episode.
+    fn snapshot(&self, slot: usize) -> Self::Snapshot;
+
+    /// Puts the slot into a state of a world with the same constants; the episode goes on from there
+    /// bit for bit as it would have where the snapshot was taken.
+    ///
+    /// # Errors
+    /// If this world has no such state; the slot stays as it is.
+    fn restore(&mut self, slot: usize, snapshot: Self::Snapshot) -> Result<(), NoSuchState>;
 
     /// Steps since the slot's last reset.
     fn time(&self, slot: usize) -> u32;

@@ -1,6 +1,6 @@
 //! What every world promises, checked on both through the `World` trait alone.
 
-use lava_envs::random::{ChaCha8Rng, Purpose, stream};
+use lava_envs::random::{ChaCha8Rng, Purpose, position, stream, stream_from};
 use lava_envs::{
     End, FiniteLaw, Force, GaussianLaw, GridConfig, LavaGrid, LavaPoint, Law, Move, PointConfig,
     Step, World,
@@ -221,6 +221,35 @@ fn a_slot_is_what_it_would_be_alone<W: Subject>() {
     }
 }
 
+/// Episodes cut anywhere go on in another batch, in other slots, and through a file's text.
+fn a_restored_episode_goes_on_bit_for_bit<W: Subject>() {
+    const SLOTS: usize = 10;
+    let mut world = W::create(SLOTS);
+    let mut chances: Vec<_> = (0..SLOTS).map(|slot| Chance::new(6, slot)).collect();
+    for cut in 0..50 {
+        run(&mut world, &mut chances, 7, |_, _, _, _| {});
+        let mut other = W::create(SLOTS);
+        let there = |slot: usize| SLOTS - 1 - slot;
+        for slot in 0..SLOTS {
+            let text = serde_json::to_string(&world.snapshot(slot)).unwrap();
+            other.restore(there(slot), serde_json::from_str(&text).unwrap()).unwrap();
+        }
+        let again = |(slot, chance): (usize, &Chance)| {
+            let position = position(&chance.random);
+            Chance { random: stream_from(6, Purpose::Outcomes, slot as u64, position) }
+        };
+        let mut others: Vec<_> = chances.iter().enumerate().map(again).rev().collect();
+        let mut expected = vec![Vec::new(); SLOTS];
+        run(&mut world, &mut chances, 60, |_, slot, sight, step| {
+            expected[slot].push((sight.clone(), step));
+        });
+        run(&mut other, &mut others, 60, |at, slot, sight, step| {
+            let (seen, happened) = &expected[there(slot)][at];
+            assert_eq!((sight, step), (seen, *happened), "cut {cut}, slot {slot}");
+        });
+    }
+}
+
 fn observations_are_finite_and_bounded<W: Subject>() {
     let mut world = W::create(20);
     let mut chances: Vec<_> = (0..20).map(|slot| Chance::new(8, slot)).collect();
@@ -256,6 +285,10 @@ macro_rules! conformance {
                 super::a_slot_is_what_it_would_be_alone::<$world>();
             }
             #[test]
+            fn a_restored_episode_goes_on_bit_for_bit() {
+                super::a_restored_episode_goes_on_bit_for_bit::<$world>();
+            }
+            #[test]
             fn observations_are_finite_and_bounded() {
                 super::observations_are_finite_and_bounded::<$world>();
             }
@@ -265,6 +298,36 @@ macro_rules! conformance {
 
 conformance!(lava_grid, LavaGrid);
 conformance!(lava_point, LavaPoint);
+
+#[test]
+fn states_that_a_world_has_not_are_refused() {
+    fn refused<W: World>(mut world: W, changes: &[(&str, &str)]) {
+        let good = serde_json::to_string(&world.snapshot(0)).unwrap();
+        for (from, to) in changes {
+            assert!(good.contains(from), "{good}");
+            let bad = serde_json::from_str(&good.replace(from, to)).unwrap();
+            assert!(world.restore(0, bad).is_err(), "{to}");
+            assert_eq!(serde_json::to_string(&world.snapshot(0)).unwrap(), good);
+        }
+    }
+    let time = ("\"time\":0", "\"time\":40");
+    let map = "S#G".to_owned();
+    let grid = LavaGrid::new(&GridConfig { map, ..GridConfig::default() }, 1).unwrap();
+    refused(grid, &[time, ("\"cell\":0", "\"cell\":1"), ("\"cell\":0", "\"cell\":3")]);
+    let point = LavaPoint::new(&PointConfig::default(), 1).unwrap();
+    let (position, velocity) = ("\"position\":[0.5,", "\"velocity\":[0.0,");
+    refused(
+        point,
+        &[
+            time,
+            (position, "\"position\":[10.5,"),
+            (position, "\"position\":[-1,"),
+            (position, "\"position\":[1e39,"),
+            (velocity, "\"velocity\":[1e4,"),
+            (velocity, "\"velocity\":[1e39,"),
+        ],
+    );
+}
 
 /// Worlds can be moved to another thread.
 #[test]

@@ -175,6 +175,14 @@ pub struct Experiment {
     pub seeds: Vec<u64>,
 }
 
+/// When unfinished runs are saved.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct CheckpointOptions {
+    /// Updates from one checkpoint to the next.
+    pub every: u64,
+}
+
 /// How a trained pair is evaluated.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -257,6 +265,8 @@ pub struct Config {
     pub gamma: f64,
     /// Device of the networks.
     pub device: Device,
+    /// When unfinished runs are saved.
+    pub checkpoint: CheckpointOptions,
     /// Evaluation protocol.
     pub evaluation: EvaluationOptions,
     /// Settings of all worlds, selected or not.
@@ -310,6 +320,7 @@ impl Config {
             experiment,
             gamma: section(&merged, "gamma")?,
             device: section(&merged, "device")?,
+            checkpoint: section(&merged, "checkpoint")?,
             evaluation: section(&merged, "evaluation")?,
             worlds,
         })
@@ -330,6 +341,7 @@ impl Config {
             device: self.device,
             env: settings.constants.clone(),
             train: settings.train.clone(),
+            checkpoint: self.checkpoint.clone(),
             evaluation: self.evaluation.clone(),
         }
     }
@@ -341,6 +353,7 @@ impl Config {
             gamma: f64,
             device: Device,
             experiment: &'a Experiment,
+            checkpoint: &'a CheckpointOptions,
             evaluation: &'a EvaluationOptions,
             env: BTreeMap<WorldName, World<'a>>,
         }
@@ -369,6 +382,7 @@ impl Config {
             gamma: self.gamma,
             device: self.device,
             experiment: &self.experiment,
+            checkpoint: &self.checkpoint,
             evaluation: &self.evaluation,
             env: env.collect(),
         };
@@ -376,7 +390,7 @@ impl Config {
     }
 }
 
-/// The resolved configuration of one run: all that decides its numbers.
+/// The resolved configuration of one run.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct RunConfig {
@@ -392,6 +406,8 @@ pub struct RunConfig {
     pub env: WorldConfig,
     /// Training options.
     pub train: TrainOptions,
+    /// When the unfinished run is saved.
+    pub checkpoint: CheckpointOptions,
     /// Evaluation protocol.
     pub evaluation: EvaluationOptions,
 }
@@ -468,12 +484,31 @@ pub struct Difference {
     pub theirs: String,
 }
 
+/// Largest rollout in environment steps: about 2 GB of records.
+const LARGEST_ROLLOUT: usize = 10_000_000;
+/// Longest schedule.
+const MOST_UPDATES: u64 = 10_000_000;
+/// Most hidden units times samples: 8 GB of activations.
+const MOST_UNITS: usize = 1_000_000_000;
+
 /// Refuses training options that are fine each and impossible together.
 fn check_together(train: &TrainOptions, world: WorldName) -> Result<(), ConfigError> {
     let conflict = |message: String| Err(ConfigError::Conflict(format!("{message} ({world})")));
-    let Some(rollout) = train.parallel_episodes.checked_mul(train.rollout_steps) else {
-        return conflict("train.parallel_episodes * train.rollout_steps is too large".into());
-    };
+    let rollout = train.parallel_episodes.saturating_mul(train.rollout_steps);
+    if rollout > LARGEST_ROLLOUT {
+        return conflict(format!(
+            "train.parallel_episodes * train.rollout_steps = {rollout} is too large; use at most \
+             {LARGEST_ROLLOUT}"
+        ));
+    }
+    let updates = train.steps / rollout as u64;
+    if updates > MOST_UPDATES {
+        return conflict(format!(
+            "train.steps = {} are {updates} updates of {rollout} steps each; use at most \
+             {MOST_UPDATES}",
+            train.steps
+        ));
+    }
     if train.steps < rollout as u64 {
         return conflict(format!(
             "train.steps = {} is less than one rollout, train.parallel_episodes * \
@@ -484,6 +519,14 @@ fn check_together(train: &TrainOptions, world: WorldName) -> Result<(), ConfigEr
     for (player, options) in
         [("protagonist", &train.protagonist), ("antagonist", &train.antagonist)]
     {
+        let units = rollout.saturating_mul(options.hidden);
+        if units > MOST_UNITS {
+            return conflict(format!(
+                "train.{player}.hidden = {} times the steps of a rollout, {rollout}, is {units}; use \
+                 at most {MOST_UNITS}",
+                options.hidden
+            ));
+        }
         if options.minibatch > rollout {
             return conflict(format!(
                 "train.{player}.minibatch = {} is more than a rollout has, \

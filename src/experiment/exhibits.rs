@@ -7,7 +7,6 @@
 //! | [`PointExhibit`] | the greedy protagonist's trajectories, and how its antagonist shifts the noise |
 //! | [`BudgetByTime`] | how the antagonist spends its budget |
 //! | [`StoredEpisode`] | whole episodes, step by step |
-//! | [`Exhibits::regret`] | how the regret fell in training (lava-grid) |
 //!
 //! The file is an addition to a run: a folder without one reports all the same.
 
@@ -35,9 +34,47 @@ pub struct Exhibits {
     pub budget: Option<BudgetByTime>,
     /// A few episodes: of each kind of chance the first ones, then the first that end in lava.
     pub stored: Vec<StoredEpisode>,
-    /// Environment steps of training, and the regret of the greedy protagonist then.
-    #[serde(default)]
-    pub regret: Vec<(u64, f64)>,
+}
+
+impl Exhibits {
+    /// What the types do not promise: that lists which belong together are equally long.
+    ///
+    /// # Errors
+    /// Names the exhibit that is damaged.
+    pub fn check(&self) -> Result<(), String> {
+        let sound = match &self.world {
+            WorldExhibit::LavaGrid(grid) => {
+                [&grid.learned, &grid.exact].into_iter().flatten().all(|of| {
+                    of.visits.len() == of.deviations.len()
+                        && of.visits.len() == grid.occupancy.len()
+                })
+            }
+            WorldExhibit::LavaPoint(point) => {
+                let bins = point.bins[0].checked_mul(point.bins[1]);
+                let whole = |map: &ShiftMap| {
+                    [map.visits.len(), map.shift.len(), map.divergence.len()]
+                        .into_iter()
+                        .all(|length| Some(length) == bins)
+                };
+                (point.shifts.is_empty() || point.shifts.len() == BUDGET_CLASSES)
+                    && point.shifts.iter().all(whole)
+            }
+        };
+        if !sound {
+            return Err("its maps are of unequal size".to_owned());
+        }
+        let whole = |of: &StoredEpisode| {
+            let steps = of.actions.len();
+            of.path.len() == steps + 1
+                && of.budgets.len() == steps + 1
+                && of.outcomes.len() == steps
+                && of.ratios.len() == steps
+        };
+        if !self.stored.iter().all(whole) {
+            return Err("a stored episode lacks a part".to_owned());
+        }
+        Ok(())
+    }
 }
 
 /// The exhibits of one world.

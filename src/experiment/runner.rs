@@ -4,24 +4,29 @@
 //! refuses one that holds something else. [`sweep`] then carries out the runs that are not finished,
 //! each by a [`Launcher`]: a worker process of its own, this process, or a mock in tests. A run that
 //! fails is told and the others go on. Artefacts appear in one piece, `evaluation.json` last, so that
-//! a run cut short is recognised and starts again from scratch.
+//! a run cut short is recognised; it goes on from its last checkpoint.
+//!
+//! Several sweeps may share a folder, on one machine or many: whoever carries out a run holds its
+//! lock, and the others work on other runs until it is free.
 
 mod worker;
 
-use super::artefacts::{Evaluation, Manifest, SCHEMA, write_in_place};
+use super::artefacts::{Evaluation, Manifest, SCHEMA, read_text, write_in_place};
+use super::checkpoint;
 use super::config::{Config, ConfigError, RunConfig};
+use super::lock::RunLock;
 use super::names::RunId;
-use super::{plan, tensorboard};
 use serde::{Deserialize, Deserializer, Serialize};
-use std::fs::{self, File, TryLockError};
+use std::collections::VecDeque;
+use std::fs;
 use std::io;
 use std::num::NonZeroUsize;
 use std::path::{Path, PathBuf};
-use std::sync::atomic::{AtomicUsize, Ordering};
-use std::sync::{Arc, Mutex, mpsc};
-use std::time::Instant;
+use std::sync::{Mutex, mpsc};
+use std::time::{Duration, Instant};
 use thiserror::Error;
 
+use super::stop::Stop;
 pub use worker::{CarryOut, InProcess, Workers, work};
 
 /// How far a run is.
@@ -32,6 +37,15 @@ pub struct Tick {
     /// Mean return of the latest rollout; NaN if no episode has ended in it.
     #[serde(deserialize_with = "null_is_nan")]
     pub mean_return: f64,
+}
+
+/// What a run tells while it is carried out.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Report {
+    /// How far it is.
+    Tick(Tick),
+    /// Something that its user should know.
+    Note(String),
 }
 
 /// JSON has no NaN; serde_json writes it as null.
@@ -50,15 +64,6 @@ pub enum RunnerError {
         /// What the system said.
         source: io::Error,
     },
-    /// Two programs would write to one folder.
-    #[error(
-        "another cvar-game is writing to {}; wait until it ends or choose another folder with --out",
-        folder.display()
-    )]
-    Busy {
-        /// The folder.
-        folder: PathBuf,
-    },
     /// A run's folder holds something else.
     #[error("{} {reason}; choose another folder with --out or remove that one", folder.display())]
     Foreign {
@@ -72,58 +77,11 @@ pub enum RunnerError {
     Schema(ConfigError),
 }
 
-/// What a signal asked for. Clones share the request.
-#[derive(Debug, Clone, Default)]
-pub struct Stop(Arc<AtomicUsize>);
-
-impl Stop {
-    /// Listens to SIGINT and SIGTERM; a second one ends the process at once.
-    ///
-    /// # Errors
-    /// If the system refuses the handler.
-    pub fn on_signals() -> io::Result<Stop> {
-        use signal_hook::consts::{SIGINT, SIGTERM};
-        use signal_hook::flag;
-        let stop = Stop::default();
-        for signal in [SIGINT, SIGTERM] {
-            let again = Arc::new(std::sync::atomic::AtomicBool::new(false));
-            flag::register_conditional_shutdown(signal, 128 + signal, Arc::clone(&again))?;
-            flag::register(signal, again)?;
-            flag::register_usize(signal, Arc::clone(&stop.0), signal as usize)?;
-        }
-        Ok(stop)
-    }
-
-    /// Makes SIGINT and SIGTERM end the process at once, with the exit code that says so: for work
-    /// in this process, whose files appear in one piece.
-    ///
-    /// # Errors
-    /// If the system refuses the handler.
-    pub fn by_ending_the_process() -> io::Result<()> {
-        use signal_hook::consts::{SIGINT, SIGTERM};
-        for signal in [SIGINT, SIGTERM] {
-            let always = Arc::new(std::sync::atomic::AtomicBool::new(true));
-            signal_hook::flag::register_conditional_shutdown(signal, 128 + signal, always)?;
-        }
-        Ok(())
-    }
-
-    /// Asks to stop, as the signal of this number would.
-    pub fn request(&self, signal: usize) {
-        self.0.store(signal, Ordering::SeqCst);
-    }
-
-    /// The number of the signal that asked to stop.
-    pub fn signal(&self) -> Option<usize> {
-        Some(self.0.load(Ordering::SeqCst)).filter(|&signal| signal != 0)
-    }
-}
-
 /// Why a run did not finish.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Failure {
-    /// It was asked to stop.
-    Stopped,
+    /// It was asked to stop, or another process works on it: to be launched again.
+    Unfinished,
     /// It failed, for this reason.
     Failed(String),
 }
@@ -131,8 +89,8 @@ pub enum Failure {
 /// Carries out one run.
 pub trait Launcher: Sync {
     /// Carries out the run in its folder, which holds its `config.toml`, and leaves its artefacts
-    /// there. Returns when the run has ended; soon after `stop` is requested, with
-    /// [`Failure::Stopped`] and nothing left running.
+    /// there, under the folder's lock. Returns when the run has ended; soon after `stop` is
+    /// requested, with [`Failure::Unfinished`] and nothing left running.
     ///
     /// # Errors
     /// If the run did not finish.
@@ -141,7 +99,7 @@ pub trait Launcher: Sync {
         run: &RunConfig,
         folder: &Path,
         stop: &Stop,
-        tick: &mut dyn FnMut(Tick),
+        report: &mut dyn FnMut(Report),
     ) -> Result<(), Failure>;
 }
 
@@ -161,6 +119,13 @@ pub enum Event {
         run: RunId,
         /// How far it is.
         tick: Tick,
+    },
+    /// A run has something to say.
+    Noted {
+        /// The run.
+        run: RunId,
+        /// What it says.
+        note: String,
     },
     /// A run has finished.
     Finished {
@@ -195,7 +160,7 @@ pub struct Outcome {
     /// The runs that failed, and why.
     pub failed: Vec<(RunId, String)>,
     /// Number of the signal that stopped the sweep.
-    pub stopped: Option<usize>,
+    pub stopped: Option<i32>,
 }
 
 /// The runs of a sweep that are still to do, all folders checked.
@@ -206,29 +171,31 @@ pub struct Prepared {
     pub todo: Vec<RunConfig>,
     /// Runs that are finished and stay as they are.
     pub finished: Vec<RunId>,
-    /// Held while the sweep writes.
-    _lock: File,
 }
 
-/// Checks that the output folder can be written and that every run's folder is new, the same run
-/// finished, or the same run cut short.
+/// Checks that the output folder can be written and that the folder of each of `runs`, which are runs
+/// of the configuration, is new, the same run finished, or the same run cut short.
 ///
 /// # Errors
 /// See [`RunnerError`]; nothing has been overwritten then.
-pub fn prepare(config: &Config, out: &Path) -> Result<Prepared, RunnerError> {
-    let lock = lock(out)?;
+pub fn prepare(config: &Config, runs: &[RunId], out: &Path) -> Result<Prepared, RunnerError> {
+    require_writable(out)?;
     let mut todo = Vec::new();
     let mut finished = Vec::new();
-    for id in plan::runs(config) {
+    for &id in runs {
         let run = config.run(id);
         if is_finished(&run, &id.folder(out))? {
+            tidy(&id.folder(out));
             finished.push(id);
         } else {
             todo.push(run);
         }
     }
-    Ok(Prepared { out: out.to_owned(), todo, finished, _lock: lock })
+    Ok(Prepared { out: out.to_owned(), todo, finished })
 }
+
+/// How long to wait for a run that another process works on before looking again.
+const PAUSE: Duration = Duration::from_millis(250);
 
 /// Carries out the runs, `jobs` at a time, and tells `watch` what happens.
 pub fn sweep(
@@ -239,23 +206,26 @@ pub fn sweep(
     watch: &mut dyn FnMut(&Event),
 ) -> Outcome {
     let Prepared { out, todo, .. } = prepared;
-    let queue = Mutex::new(todo.iter());
+    let queue: Mutex<VecDeque<&RunConfig>> = Mutex::new(todo.iter().collect());
     let (events, incoming) = mpsc::channel();
     let mut outcome = Outcome::default();
     std::thread::scope(|scope| {
         for _ in 0..jobs.get().min(todo.len()) {
             let events = events.clone();
             let queue = &queue;
+            let queue = || queue.lock().expect("no thread panics here");
             scope.spawn(move || {
                 while stop.signal().is_none() {
-                    let Some(run) = queue.lock().expect("no thread panics here").next() else {
-                        break;
-                    };
+                    let Some(run) = queue().pop_front() else { break };
                     // The receiver lives until all senders are gone.
                     let mut send = |event| events.send(event).expect("the sweep listens");
-                    send(Event::Started { run: run.id(), steps: run.train.steps });
-                    let end = carry_out(run, out, launcher, stop, &mut send);
-                    send(end);
+                    match carry_out(run, out, launcher, stop, &mut send) {
+                        Some(end) => send(end),
+                        None => {
+                            queue().push_back(run);
+                            std::thread::sleep(PAUSE);
+                        }
+                    }
                 }
             });
         }
@@ -265,7 +235,7 @@ pub fn sweep(
             match event {
                 Event::Finished { .. } => outcome.finished += 1,
                 Event::Failed { run, reason, .. } => outcome.failed.push((run, reason)),
-                Event::Started { .. } | Event::Ticked { .. } | Event::Stopped { .. } => {}
+                _ => {}
             }
         }
     });
@@ -273,59 +243,73 @@ pub fn sweep(
     outcome
 }
 
-/// One run from an empty folder to its end.
+/// One run to its end; `None` if it has to be tried again, because another process works on it.
 fn carry_out(
     run: &RunConfig,
     out: &Path,
     launcher: &dyn Launcher,
     stop: &Stop,
     send: &mut dyn FnMut(Event),
-) -> Event {
+) -> Option<Event> {
     let id = run.id();
     let folder = id.folder(out);
     let start = Instant::now();
     let mut steps = 0;
-    let mut tick = |tick: Tick| {
-        steps = tick.steps;
-        send(Event::Ticked { run: id, tick });
+    let result = match begin(run, &folder) {
+        Ok(Begun::Free) => {
+            send(Event::Started { run: id, steps: run.train.steps });
+            launcher.launch(run, &folder, stop, &mut |report| {
+                send(match report {
+                    Report::Tick(tick) => {
+                        steps = tick.steps;
+                        Event::Ticked { run: id, tick }
+                    }
+                    Report::Note(note) => Event::Noted { run: id, note },
+                });
+            })
+        }
+        Ok(Begun::Finished) => Ok(()),
+        Ok(Begun::Busy) => Err(Failure::Unfinished),
+        Err(reason) => Err(Failure::Failed(reason)),
     };
-    let result = clear(run, &folder)
-        .map_err(|error| Failure::Failed(format!("cannot write to {}: {error}", folder.display())))
-        .and_then(|()| launcher.launch(run, &folder, stop, &mut tick))
-        .and_then(|()| {
-            read_evaluation(&folder)
-                .map_err(|error| Failure::Failed(error.to_string()))?
-                .ok_or_else(|| Failure::Failed("it ended without an evaluation.json".into()))
-        });
+    let result = match (result, read_evaluation(&folder)) {
+        // However its process ended: it had nothing left to do.
+        (_, Ok(Some(evaluation))) => Ok(evaluation),
+        (Err(failure), _) => Err(failure),
+        (Ok(()), Ok(None)) => Err(Failure::Failed("it ended without an evaluation.json".into())),
+        (Ok(()), Err(error)) => Err(Failure::Failed(error.to_string())),
+    };
     let seconds = start.elapsed().as_secs_f64();
     match result {
-        Ok(evaluation) => Event::Finished { run: id, seconds, evaluation: Box::new(evaluation) },
-        Err(Failure::Stopped) => Event::Stopped { run: id },
+        Ok(evaluation) => {
+            tidy(&folder);
+            Some(Event::Finished { run: id, seconds, evaluation: Box::new(evaluation) })
+        }
+        Err(Failure::Unfinished) => stop.signal().map(|_| Event::Stopped { run: id }),
         Err(Failure::Failed(reason)) => {
             // The failure is told anyway; a full disk must not hide it.
             let _ = record_failure(run, &folder, &reason, steps, seconds);
-            Event::Failed { run: id, seconds, reason }
+            Some(Event::Failed { run: id, seconds, reason })
         }
     }
 }
 
-/// The lock of an output folder, which is made if need be.
-fn lock(out: &Path) -> Result<File, RunnerError> {
-    let refused = |source| RunnerError::Output { folder: out.to_owned(), source };
-    fs::create_dir_all(out).map_err(refused)?;
-    let lock = File::create(out.join(".lock")).map_err(refused)?;
-    match lock.try_lock() {
-        Ok(()) => Ok(lock),
-        Err(TryLockError::WouldBlock) => Err(RunnerError::Busy { folder: out.to_owned() }),
-        Err(TryLockError::Error(source)) => Err(refused(source)),
-    }
+/// Makes the output folder and writes a file into it for a moment.
+fn require_writable(out: &Path) -> Result<(), RunnerError> {
+    fs::create_dir_all(out)
+        .and_then(|()| tempfile::tempfile_in(out))
+        .map(drop)
+        .map_err(|source| RunnerError::Output { folder: out.to_owned(), source })
 }
 
 /// Whether the folder holds this run, finished.
 fn is_finished(run: &RunConfig, folder: &Path) -> Result<bool, RunnerError> {
     let foreign = |reason: String| RunnerError::Foreign { folder: folder.to_owned(), reason };
     let is_empty = match fs::read_dir(folder) {
-        Ok(mut entries) => entries.next().is_none(),
+        // Hidden files are a lock, and what is left of a file that was being written.
+        Ok(entries) => entries
+            .map_while(Result::ok)
+            .all(|entry| entry.file_name().as_encoded_bytes().starts_with(b".")),
         Err(error) if error.kind() == io::ErrorKind::NotFound => true,
         Err(error) => return Err(foreign(format!("cannot be read ({error})"))),
     };
@@ -367,7 +351,7 @@ fn is_finished(run: &RunConfig, folder: &Path) -> Result<bool, RunnerError> {
 /// If it is damaged or of another schema version.
 pub fn read_evaluation(folder: &Path) -> Result<Option<Evaluation>, RunnerError> {
     let foreign = |reason: String| RunnerError::Foreign { folder: folder.to_owned(), reason };
-    let text = match fs::read_to_string(folder.join("evaluation.json")) {
+    let text = match read_text(&folder.join("evaluation.json")) {
         Ok(text) => text,
         Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(None),
         Err(error) => return Err(foreign(format!("has an unreadable evaluation.json ({error})"))),
@@ -383,29 +367,44 @@ pub fn read_evaluation(folder: &Path) -> Result<Option<Evaluation>, RunnerError>
     serde_json::from_value(value).map(Some).map_err(damaged)
 }
 
-/// Makes the folder, removes what an earlier attempt left and writes `config.toml`.
-fn clear(run: &RunConfig, folder: &Path) -> io::Result<()> {
-    fs::create_dir_all(folder)?;
-    for name in [
-        "manifest.json",
-        "progress.csv",
-        tensorboard::FILE,
-        "final.safetensors",
-        "exhibits.json",
-        LOG,
-    ] {
-        match fs::remove_file(folder.join(name)) {
-            Err(error) if error.kind() != io::ErrorKind::NotFound => return Err(error),
-            _ => {}
-        }
+/// How a run's folder is found when its turn comes.
+enum Begun {
+    /// To be carried out.
+    Free,
+    /// Another process works on it.
+    Busy,
+    /// Another process has finished it meanwhile.
+    Finished,
+}
+
+/// Makes the folder with its `config.toml`, if nobody else works there.
+fn begin(run: &RunConfig, folder: &Path) -> Result<Begun, String> {
+    let refused = |error| format!("cannot write to {}: {error}", folder.display());
+    fs::create_dir_all(folder).map_err(refused)?;
+    let Some(_lock) = RunLock::take(folder).map_err(refused)? else { return Ok(Begun::Busy) };
+    // Looked at again: another sweep may have been here since `prepare`.
+    if is_finished(run, folder).map_err(|error| error.to_string())? {
+        return Ok(Begun::Finished);
     }
-    write_in_place(&folder.join("config.toml"), run.to_toml().as_bytes())
+    write_in_place(&folder.join("config.toml"), run.to_toml().as_bytes()).map_err(refused)?;
+    Ok(Begun::Free)
 }
 
 /// What a worker printed on standard error; empty logs are removed.
 const LOG: &str = "worker.log";
 
-/// Notes the failure in the run's manifest; a run that died before it wrote one gets it here.
+/// Removes what a finished run needs no more and was killed before it could remove.
+fn tidy(folder: &Path) {
+    // A folder that cannot be written keeps it.
+    let _ = checkpoint::remove(folder);
+    let log = folder.join(LOG);
+    if fs::metadata(&log).is_ok_and(|log| log.len() == 0) {
+        let _ = fs::remove_file(log);
+    }
+}
+
+/// Notes the failure in the run's manifest; a run that died before it wrote one gets it here. If
+/// somebody else has taken up the run, the manifest is theirs.
 fn record_failure(
     run: &RunConfig,
     folder: &Path,
@@ -413,8 +412,9 @@ fn record_failure(
     steps: u64,
     seconds: f64,
 ) -> io::Result<()> {
+    let Some(_lock) = RunLock::take(folder)? else { return Ok(()) };
     let path = folder.join("manifest.json");
-    let written = fs::read(&path).ok().and_then(|bytes| serde_json::from_slice(&bytes).ok());
+    let written = read_text(&path).ok().and_then(|text| serde_json::from_str(&text).ok());
     let mut manifest =
         written.unwrap_or_else(|| Manifest::of(run.id(), &run.device.to_string(), steps, seconds));
     manifest.failure.get_or_insert_with(|| reason.to_owned());

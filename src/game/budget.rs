@@ -72,6 +72,9 @@ impl std::fmt::Display for Eta {
     }
 }
 
+/// Remaining budgets are cut off here, which leaves the antagonist less than it has.
+const LARGEST: f64 = 1e300;
+
 /// The remaining budget eta_t >= 1 of one trajectory.
 #[derive(Debug, Clone, Copy, PartialEq, PartialOrd)]
 pub struct Budget(f64);
@@ -80,6 +83,14 @@ impl Budget {
     /// The budget at the start of a trajectory.
     pub fn start(eta: Eta) -> Self {
         Budget(eta.0)
+    }
+
+    /// The remaining budget of a trajectory that goes on.
+    ///
+    /// # Errors
+    /// [`NotABudget`] if it is below 1 or not finite.
+    pub fn remaining(budget: f64) -> Result<Self, NotABudget> {
+        Eta::new(budget).map(Budget::start)
     }
 
     /// The number eta_t.
@@ -101,7 +112,7 @@ impl Budget {
             self.0
         );
         // The ratio may exceed the budget by rounding alone.
-        Budget((self.0 / likelihood_ratio).max(1.0))
+        Budget((self.0 / likelihood_ratio).clamp(1.0, LARGEST))
     }
 
     /// Identity mixing, the paper's "convex rescaling": given log M of a normalised perturbation
@@ -135,7 +146,9 @@ pub struct Mixing {
 impl Mixing {
     /// delta(o), from delta^0(o).
     pub fn likelihood_ratio(&self, base: f64) -> f64 {
-        (1.0 - self.weight) + self.weight * base
+        let ratio = (1.0 - self.weight) + self.weight * base;
+        // Positive in truth, though delta^0 far from its bump rounds to 0.
+        if ratio == 0.0 { f64::MIN_POSITIVE } else { ratio }
     }
 
     /// Derivatives of delta(o) by log delta^0(o) and by log M, gradients flowing through lambda:

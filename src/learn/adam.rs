@@ -1,11 +1,13 @@
 //! Adam (Kingma & Ba 2015) over one flat vector, with all of its state in the open.
 
+use serde::{Deserialize, Serialize};
+
 /// Decay rates and the guard of the division, as everywhere in PPO (epsilon is CleanRL's).
 const BETA: [f64; 2] = [0.9, 0.999];
 const EPSILON: f64 = 1e-5;
 
 /// The optimiser of one player.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Adam {
     first_moment: Vec<f32>,
     second_moment: Vec<f32>,
@@ -16,6 +18,15 @@ impl Adam {
     /// A fresh optimiser of `parameters` numbers.
     pub fn new(parameters: usize) -> Self {
         Adam { first_moment: vec![0.0; parameters], second_moment: vec![0.0; parameters], steps: 0 }
+    }
+
+    /// Whether this is the state of an optimiser of `parameters` numbers.
+    pub fn fits(&self, parameters: usize) -> bool {
+        // The second moment is a mean of squares; its root is taken.
+        let moments = self.first_moment.iter().chain(&self.second_moment);
+        [self.first_moment.len(), self.second_moment.len()] == [parameters; 2]
+            && moments.into_iter().all(|moment| moment.is_finite())
+            && self.second_moment.iter().all(|&moment| moment >= 0.0)
     }
 
     /// One step of descent along `gradient`.

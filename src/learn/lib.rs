@@ -8,6 +8,7 @@
 //! | what a network's outputs mean | [`head`] |
 //! | one step of the game | [`contest`] |
 //! | what a player sees | [`pair`] |
+//! | what training goes on from | [`checkpoint`] |
 //! | how a trained pair is judged | [`protocol`] |
 //!
 //! A crate of its own, so that the program that solves the worlds and reports starts without loading
@@ -17,6 +18,7 @@
 
 pub mod adam;
 pub mod arena;
+pub mod checkpoint;
 pub mod contest;
 pub mod gae;
 pub mod head;

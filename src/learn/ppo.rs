@@ -11,6 +11,7 @@
 //! to the parameters.
 
 use crate::adam::Adam;
+use crate::checkpoint::{PlayerState, Unfit};
 use crate::gae;
 use crate::head::{Head, MAX_PARAMETERS};
 use crate::network::{Network, Outputs, Shape};
@@ -116,6 +117,46 @@ impl<H: Head> Player<H> {
         assert!(shape.outputs + shape.constants <= MAX_PARAMETERS, "parameters of the head");
         let optimiser = Adam::new(shape.parameters());
         Player { head, network, optimiser }
+    }
+
+    /// What of the player is not a finite number, or will not be when it plays.
+    pub fn not_finite(&self) -> Option<&'static str> {
+        // Inputs are about 1 and tanh units at most 1: with these weights no f32 can overflow.
+        const LARGEST: f32 = 1e15;
+        let constants = self.network.constants();
+        let parameters = self.network.parameters();
+        if !parameters.iter().all(|parameter| parameter.is_finite()) {
+            Some("a weight")
+        } else if !parameters.iter().all(|parameter| parameter.abs() <= LARGEST) {
+            Some("a network's output")
+        } else if !constants.iter().all(|&log| f64::from(log).exp().is_finite()) {
+            Some("a standard deviation")
+        } else {
+            None
+        }
+    }
+
+    /// All that the next updates depend on.
+    pub fn state(&self) -> PlayerState {
+        PlayerState {
+            parameters: self.network.parameters().to_vec(),
+            optimiser: self.optimiser.clone(),
+        }
+    }
+
+    /// Goes on from a state.
+    ///
+    /// # Errors
+    /// If it is of another network or not finite.
+    pub fn restore(&mut self, state: PlayerState) -> Result<(), Unfit> {
+        let PlayerState { parameters, optimiser } = state;
+        let count = self.network.shape().parameters();
+        if parameters.len() != count || !optimiser.fits(count) {
+            return Err(Unfit("a player's"));
+        }
+        self.network.change(|own| own.copy_from_slice(&parameters));
+        self.optimiser = optimiser;
+        self.not_finite().map_or(Ok(()), |_| Err(Unfit("a player's")))
     }
 
     /// Parameters of the head in a slot: the actor's outputs there, of shape `[k, slots]`, and the

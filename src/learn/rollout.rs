@@ -1,14 +1,15 @@
 //! Rollouts: a fixed number of steps of parallel games, recorded for both players.
 
 use crate::arena::Arena;
+use crate::checkpoint::{GamesState, Running, SlotState, Unfit};
 use crate::contest::{Chance, Choosing, Contest, Streams};
 use crate::head::{AntagonistHead, Head};
 use crate::pair::Pair;
 use crate::trajectories::Trajectories;
-use cvar_game::game::budget::Eta;
+use cvar_game::game::budget::{Budget, Eta};
 use cvar_game::game::returns::Atom;
 use cvar_game::options::Credit;
-use lava_envs::random::{Purpose, stream};
+use lava_envs::random::{Purpose, position, stream, stream_from};
 use lava_envs::{End, Law};
 
 /// Plays and records.
@@ -26,22 +27,6 @@ pub struct Collector<W: Arena> {
     pub finished: Vec<Atom>,
     /// max prod delta / eta over all trajectories so far, at most 1 up to rounding.
     pub budget_use: f64,
-}
-
-/// Sums of the episode in a slot.
-#[derive(Debug, Clone, Copy)]
-struct Running {
-    value: f64,
-    undiscounted: f64,
-    discount: f64,
-    steps: u32,
-    /// prod delta so far.
-    product: f64,
-}
-
-impl Running {
-    const START: Running =
-        Running { value: 0.0, undiscounted: 0.0, discount: 1.0, steps: 0, product: 1.0 };
 }
 
 impl<W: Arena> Collector<W> {
@@ -159,6 +144,45 @@ impl<W: Arena> Collector<W> {
             self.budget_use = self.budget_use.max(product / self.start[slot].get());
             self.begin(slot, eta);
         }
+    }
+
+    /// All that the next rollouts depend on beside the players.
+    pub fn state(&self) -> GamesState<W::Snapshot> {
+        let slot = |slot: usize| SlotState {
+            episode: self.contest.world.snapshot(slot),
+            budget: self.contest.budgets[slot].get(),
+            start: self.start[slot].get(),
+            running: self.running[slot],
+            actions: position(&self.contest.streams[slot].actions),
+            outcomes: position(&self.contest.streams[slot].outcomes),
+        };
+        let slots = (0..self.contest.slots()).map(slot).collect();
+        GamesState { slots, budget_use: self.budget_use }
+    }
+
+    /// Goes on from a state of a run with this seed.
+    ///
+    /// # Errors
+    /// If the state is of other games; part of it may be in place then.
+    pub fn restore(&mut self, state: &GamesState<W::Snapshot>, seed: u64) -> Result<(), Unfit> {
+        if state.slots.len() != self.contest.slots() {
+            return Err(Unfit("the games'"));
+        }
+        for (slot, there) in state.slots.iter().enumerate() {
+            let restored = self.contest.world.restore(slot, there.episode);
+            restored.map_err(|_| Unfit("the world's"))?;
+            let refused = |_| Unfit("the budget's");
+            self.contest.budgets[slot] = Budget::remaining(there.budget).map_err(refused)?;
+            self.start[slot] = Eta::new(there.start).map_err(refused)?;
+            self.running[slot] = there.running;
+            let index = slot as u64;
+            self.contest.streams[slot] = Streams {
+                actions: stream_from(seed, Purpose::Actions, index, there.actions),
+                outcomes: stream_from(seed, Purpose::Outcomes, index, there.outcomes),
+            };
+        }
+        self.budget_use = state.budget_use;
+        Ok(())
     }
 
     /// Mean undiscounted return of the episodes that ended in the last rollout; NaN if none did.

@@ -1,13 +1,14 @@
 //! Algorithm 1 of the paper: the two players are updated in turn, each on a fresh rollout.
 
 use crate::arena::Arena;
+use crate::checkpoint::{TrainingState, Unfit};
 use crate::pair::Pair;
-use crate::ppo::{Losses, Rates};
+use crate::ppo::{Losses, Player, Rates};
 use crate::rollout::Collector;
 use cvar_game::game::budget::Eta;
 use cvar_game::options::{PlayerOptions, Role, TrainOptions};
 use lava_envs::End;
-use lava_envs::random::{Purpose, stream};
+use lava_envs::random::{ChaCha8Rng, Purpose, position, stream, stream_from};
 use tch::Device;
 
 /// Everything that determines a training run, the world apart.
@@ -70,46 +71,84 @@ pub enum TrainError {
 
 /// Trains a pair of players on `world`, whose slots are the parallel episodes.
 ///
-/// `observe` is told of every update and shown the pair as it is then.
+/// `observe` is told of every update.
 ///
 /// # Errors
 /// [`TrainError::NotFinite`] at the first quantity that is not a finite number.
 pub fn train<W: Arena>(
     world: W,
     game: &Game<'_>,
-    mut observe: impl FnMut(&Progress, &Pair<W>),
+    mut observe: impl FnMut(&Progress),
 ) -> Result<Pair<W>, TrainError> {
-    let options = game.options;
-    let mut pair = Pair::<W>::new(options, game.eta, game.seed, game.device);
-    let mut collector = Collector::new(world, &pair, game.gamma, game.seed);
-    let mut minibatches = stream(game.seed, Purpose::Minibatches, 0);
-    for turn in schedule(options, game.eta) {
-        collector.collect(&pair, turn.budget, options.rollout_steps, options.credit);
+    let mut training = Training::new(world, game);
+    while let Some(progress) = training.update()? {
+        observe(&progress);
+    }
+    Ok(training.pair)
+}
+
+/// Training, update by update; between two updates it can be saved and restored.
+pub struct Training<'a, W: Arena> {
+    game: &'a Game<'a>,
+    turns: Vec<Turn>,
+    /// Updates done.
+    done: usize,
+    /// The players.
+    pub pair: Pair<W>,
+    collector: Collector<W>,
+    minibatches: ChaCha8Rng,
+}
+
+impl<'a, W: Arena> Training<'a, W> {
+    /// Training from its beginning, on `world`, whose slots are the parallel episodes.
+    pub fn new(world: W, game: &'a Game<'a>) -> Self {
+        let pair = Pair::<W>::new(game.options, game.eta, game.seed, game.device);
+        let collector = Collector::new(world, &pair, game.gamma, game.seed);
+        Training {
+            game,
+            turns: schedule(game.options, game.eta),
+            done: 0,
+            pair,
+            collector,
+            minibatches: stream(game.seed, Purpose::Minibatches, 0),
+        }
+    }
+
+    /// The next update; none is left after the last one.
+    ///
+    /// # Errors
+    /// [`TrainError::NotFinite`] at the first quantity that is not a finite number.
+    pub fn update(&mut self) -> Result<Option<Progress>, TrainError> {
+        let Some(&turn) = self.turns.get(self.done) else { return Ok(None) };
+        let Game { gamma, options, .. } = *self.game;
+        let Training { pair, collector, minibatches, .. } = self;
+        collector.collect(pair, turn.budget, options.rollout_steps, options.credit);
         let rates = turn.rates;
         let losses = match (turn.role, &mut pair.antagonist) {
             (Role::Antagonist, Some(antagonist)) => antagonist.update(
                 &collector.antagonist,
-                game.gamma,
+                gamma,
                 &options.antagonist,
                 rates,
-                &mut minibatches,
+                minibatches,
             ),
             _ => pair.protagonist.update(
                 &collector.protagonist,
-                game.gamma,
+                gamma,
                 &options.protagonist,
                 rates,
-                &mut minibatches,
+                minibatches,
             ),
         };
-        let diverged = losses.not_finite().or_else(|| {
-            let finite = pair.parameters(turn.role).iter().all(|p| p.is_finite());
-            (!finite).then_some("a weight")
+        let diverged = losses.not_finite().or_else(|| match (turn.role, &pair.antagonist) {
+            (Role::Antagonist, Some(antagonist)) => antagonist.not_finite(),
+            _ => pair.protagonist.not_finite(),
         });
         if let Some(quantity) = diverged {
             return Err(TrainError::NotFinite { update: turn.update, role: turn.role, quantity });
         }
-        let progress = Progress {
+        self.done += 1;
+        Ok(Some(Progress {
             update: turn.update,
             steps: turn.update * options.rollout(),
             role: turn.role,
@@ -120,10 +159,44 @@ pub fn train<W: Arena>(
             learning_rate: rates.learning_rate,
             losses,
             budget_use: collector.budget_use,
-        };
-        observe(&progress, &pair);
+        }))
     }
-    Ok(pair)
+
+    /// Updates done.
+    pub fn updates(&self) -> u64 {
+        self.done as u64
+    }
+
+    /// All that the updates to come depend on.
+    pub fn state(&self) -> TrainingState<W::Snapshot> {
+        TrainingState {
+            update: self.updates(),
+            minibatches: position(&self.minibatches),
+            protagonist: self.pair.protagonist.state(),
+            antagonist: self.pair.antagonist.as_ref().map(Player::state),
+            games: self.collector.state(),
+        }
+    }
+
+    /// Goes on from a state of training in the same game.
+    ///
+    /// # Errors
+    /// If the state is of another game; part of it may be in place then.
+    pub fn restore(&mut self, state: TrainingState<W::Snapshot>) -> Result<(), Unfit> {
+        let done = usize::try_from(state.update).ok().filter(|&done| done <= self.turns.len());
+        let done = done.ok_or(Unfit("the schedule's"))?;
+        self.pair.protagonist.restore(state.protagonist)?;
+        match (&mut self.pair.antagonist, state.antagonist) {
+            (Some(antagonist), Some(state)) => antagonist.restore(state)?,
+            (None, None) => {}
+            _ => return Err(Unfit("a player's")),
+        }
+        self.collector.restore(&state.games, self.game.seed)?;
+        let seed = self.game.seed;
+        self.minibatches = stream_from(seed, Purpose::Minibatches, 0, state.minibatches);
+        self.done = done;
+        Ok(())
+    }
 }
 
 /// One update of one player.

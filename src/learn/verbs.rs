@@ -15,10 +15,12 @@ use cvar_game::cli::{
 };
 use cvar_game::experiment::artefacts::{Chance, Mode};
 use cvar_game::experiment::config::{Config, Device, RunConfig, Setting};
+use cvar_game::experiment::names::RunId;
 use cvar_game::experiment::plan;
 use cvar_game::experiment::runner::{
-    self, InProcess, Launcher, Outcome, Prepared, Stop, Tick, Workers,
+    self, Failure, InProcess, Launcher, Outcome, Prepared, Report, Workers,
 };
+use cvar_game::experiment::stop::{self, Stop};
 use cvar_game::report;
 use progress::Progress;
 use std::io::{self, BufWriter};
@@ -47,11 +49,7 @@ fn play(verb: PlayVerb) -> Result<ExitCode> {
         PlayVerb::Train(args) => train(&args),
         PlayVerb::Evaluate(args) => evaluate(&args),
         PlayVerb::Rollout(args) => rollout(&args),
-        PlayVerb::Worker { folder } => Ok(if runner::work(&folder, carry_out) {
-            ExitCode::SUCCESS
-        } else {
-            ExitCode::from(FAILED)
-        }),
+        PlayVerb::Worker { folder } => Ok(ExitCode::from(runner::work(&folder, carry_out))),
     }
 }
 
@@ -64,19 +62,23 @@ fn bench(args: &BenchArgs) -> Result<ExitCode> {
             Path::new("results").join(args.config.file_stem().context("--config names no file")?)
         }
     };
-    let prepared = prepare(&config, &out)?;
+    let mut runs = plan::runs(&config);
+    if let Some(only) = args.only {
+        if !runs.contains(&only) {
+            bail!("--only {only}: the configuration has no such run; its first one is {}", runs[0]);
+        }
+        runs = vec![only];
+    }
+    let prepared = prepare(&config, &runs, &out)?;
     let jobs = match args.jobs {
         Some(jobs) => jobs,
         None => std::thread::available_parallelism().unwrap_or(NonZeroUsize::MIN),
     };
     let stop = Stop::on_signals().context("cannot listen to signals")?;
     let outcome = sweep(&prepared, jobs, &Workers::of_this_program()?, &stop);
-    if let Some(signal) = outcome.stopped {
-        eprintln!("stopped; finished runs are kept, and the same command goes on with the rest");
-        return Ok(ExitCode::from(128 + signal as u8));
-    }
-    let code = tell_failures(&outcome);
-    if code == ExitCode::SUCCESS || outcome.finished > 0 {
+    let any_finished = outcome.finished + prepared.finished.len() > 0;
+    let code = tell_end(&outcome);
+    if outcome.stopped.is_none() && args.only.is_none() && any_finished {
         let written = report::write_all(&out)?;
         print(&written.table)?;
         eprintln!("written to {}", out.display());
@@ -94,16 +96,16 @@ fn train(args: &TrainArgs) -> Result<ExitCode> {
     options.extend(args.device.map(device));
     let config = args.overrides.resolve(args.config.as_deref(), options)?;
     let id = plan::runs(&config)[0];
-    let prepared = prepare(&config, &args.out)?;
+    let prepared = prepare(&config, &[id], &args.out)?;
     let outcome = if prepared.todo.is_empty() {
         eprintln!("{id} has finished before; remove its folder to run it again");
         Outcome::default()
     } else {
-        Stop::by_ending_the_process().context("cannot listen to signals")?;
-        sweep(&prepared, NonZeroUsize::MIN, &InProcess(carry_out), &Stop::default())
+        let stop = Stop::on_signals().context("cannot listen to signals")?;
+        sweep(&prepared, NonZeroUsize::MIN, &InProcess(carry_out), &stop)
     };
     let folder = id.folder(&args.out);
-    let code = tell_failures(&outcome);
+    let code = tell_end(&outcome);
     match runner::read_evaluation(&folder)? {
         Some(evaluation) if code == ExitCode::SUCCESS => {
             let summary = answer::Summary::new(&evaluation, &folder);
@@ -114,8 +116,8 @@ fn train(args: &TrainArgs) -> Result<ExitCode> {
 }
 
 /// Checks everything that can be checked before the first run starts.
-fn prepare(config: &Config, out: &Path) -> Result<Prepared> {
-    let prepared = runner::prepare(config, out)?;
+fn prepare(config: &Config, runs: &[RunId], out: &Path) -> Result<Prepared> {
+    let prepared = runner::prepare(config, runs, out)?;
     if !prepared.todo.is_empty() {
         require_device(config.device)?;
     }
@@ -130,9 +132,14 @@ fn sweep(prepared: &Prepared, jobs: NonZeroUsize, launcher: &dyn Launcher, stop:
     outcome
 }
 
-fn tell_failures(outcome: &Outcome) -> ExitCode {
+/// Tells why runs did not finish; the exit code.
+fn tell_end(outcome: &Outcome) -> ExitCode {
     for (run, reason) in &outcome.failed {
         eprintln!("error: {run} failed: {reason}");
+    }
+    if let Some(signal) = outcome.stopped {
+        eprintln!("stopped; finished runs are kept, and the same command goes on with the rest");
+        return ExitCode::from(stop::exit_code(signal));
     }
     if outcome.failed.is_empty() { ExitCode::SUCCESS } else { ExitCode::from(FAILED) }
 }
@@ -191,8 +198,16 @@ fn rollout(args: &RolloutArgs) -> Result<ExitCode> {
 }
 
 /// Carries out a run for the runner, which wants its failure in words.
-fn carry_out(run: &RunConfig, folder: &Path, tick: &mut dyn FnMut(Tick)) -> Result<(), String> {
-    execute(run, folder, tick).map_err(|error| error.to_string())
+fn carry_out(
+    run: &RunConfig,
+    folder: &Path,
+    stop: &Stop,
+    report: &mut dyn FnMut(Report),
+) -> Result<(), Failure> {
+    execute(run, folder, stop, report).map_err(|error| match error {
+        RunError::Unfinished => Failure::Unfinished,
+        error => Failure::Failed(error.to_string()),
+    })
 }
 
 fn chance(antagonist: Antagonist) -> Chance {

@@ -36,6 +36,14 @@ pub enum WeightsError {
         /// What the file has.
         found: String,
     },
+    /// Numbers that no player can play with.
+    #[error("{quantity} of the {role} is not finite")]
+    NotFinite {
+        /// Whose.
+        role: Role,
+        /// What.
+        quantity: &'static str,
+    },
 }
 
 /// The players as the bytes of a safetensors file, with `about` in its header.
@@ -109,7 +117,8 @@ fn restore<H: Head>(
         player.head.clone(),
         Network::from_parameters(shape, parameters, device),
     );
-    Ok(())
+    let refused = |quantity| WeightsError::NotFinite { role, quantity };
+    player.not_finite().map_or(Ok(()), |quantity| Err(refused(quantity)))
 }
 
 /// Where a tensor's entries lie in the flat parameters: entry (i, j) at

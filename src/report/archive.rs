@@ -2,6 +2,7 @@
 
 use super::ReportError;
 use super::runs::{Run, read_json};
+use crate::experiment::artefacts::read_text;
 use crate::experiment::config::WorldConfig;
 use crate::experiment::exhibits::Exhibits;
 use serde::Deserialize;
@@ -16,8 +17,9 @@ pub struct Update {
     pub player: String,
     /// Mean return of the episodes that ended in the rollout.
     pub mean_return: f64,
-    /// Budget of the rollout.
-    pub budget: f64,
+    /// Regret of the greedy protagonist, where it was measured; former versions have no such column.
+    #[serde(default)]
+    pub regret: Option<f64>,
 }
 
 /// What lies in a run's folder beside the evaluation.
@@ -41,9 +43,19 @@ impl Archive {
         Ok(Archive {
             world: world(&run.folder.join("config.toml"))?,
             progress: progress(&run.folder.join("progress.csv"))?,
-            exhibits: read_json(&run.folder.join("exhibits.json"))?,
+            exhibits: exhibits(run)?,
         })
     }
+}
+
+/// `exhibits.json` of a run.
+pub(super) fn exhibits(run: &Run) -> Result<Option<Exhibits>, ReportError> {
+    let path = run.folder.join("exhibits.json");
+    let exhibits: Option<Exhibits> = read_json(&path)?;
+    if let Some(exhibits) = &exhibits {
+        exhibits.check().map_err(|what| ReportError::Corrupt { path, what })?;
+    }
+    Ok(exhibits)
 }
 
 /// The two keys that figures need; other keys are the business of the version that wrote them.
@@ -71,7 +83,7 @@ fn progress(path: &Path) -> Result<Vec<Update>, ReportError> {
 }
 
 fn text(path: &Path) -> Result<Option<String>, ReportError> {
-    match std::fs::read_to_string(path) {
+    match read_text(path) {
         Ok(text) => Ok(Some(text)),
         Err(error) if error.kind() == std::io::ErrorKind::NotFound => Ok(None),
         Err(source) => Err(ReportError::Read { path: path.to_path_buf(), source }),

@@ -5,11 +5,10 @@
 use super::figures::Figures;
 use super::group::Group;
 use super::render::{columns, legend, row_headings, row_name, seeds, words};
-use super::runs::read_json;
 use super::table::{Block, Cell, Row, Table, World};
 use super::{ReportError, archive};
 use crate::experiment::config::WorldConfig;
-use crate::experiment::exhibits::{Exhibits, StoredEpisode};
+use crate::experiment::exhibits::StoredEpisode;
 use lava_envs::LavaGrid;
 use maud::{DOCTYPE, Markup, PreEscaped, html};
 use serde::Serialize;
@@ -254,7 +253,7 @@ impl Episodes {
         for group in groups {
             let mut played = 0;
             for run in group.runs {
-                let exhibits: Option<Exhibits> = read_json(&run.folder.join("exhibits.json"))?;
+                let exhibits = archive::exhibits(run)?;
                 let Some(exhibits) =
                     exhibits.filter(|of| played < PLAYED_SEEDS && !of.stored.is_empty())
                 else {

@@ -43,7 +43,9 @@
 //! | `budget_violations` | steps or trajectories beyond tolerance, 0 |
 
 use super::{ReportError, statistics};
-use crate::experiment::artefacts::{Chance, Evaluation, Manifest, Mode, Play, SCHEMA};
+use crate::experiment::artefacts::{
+    Chance, Evaluation, LARGEST_FILE, Manifest, Mode, Play, SCHEMA, read_at_most,
+};
 use crate::game::returns::{Atom, ReturnLaw};
 use lava_envs::End;
 use serde::Deserialize;
@@ -317,7 +319,7 @@ fn read_run(folder: &Path, env: &str, eta: f64, seed: u64) -> Result<Option<Run>
 /// Reads a file of ours; `None` if there is none. The version is looked at first: what another
 /// version wrote is not damaged.
 pub(super) fn read_json<T: DeserializeOwned>(path: &Path) -> Result<Option<T>, ReportError> {
-    let text = match std::fs::read(path) {
+    let text = match read_at_most(path, LARGEST_FILE) {
         Ok(text) => text,
         Err(error) if error.kind() == std::io::ErrorKind::NotFound => return Ok(None),
         Err(source) => return Err(ReportError::Read { path: path.to_path_buf(), source }),

@@ -193,7 +193,7 @@ mod runs {
         ";
 
     /// A run that would take hours.
-    const ENDLESS: &str = "train.steps=9_000_000_000";
+    const ENDLESS: &str = "train.steps=4_000_000_000";
 
     #[test]
     fn train_ends_with_its_summary_and_keeps_a_finished_run() {
@@ -301,7 +301,7 @@ mod runs {
 
     #[test]
     fn a_signal_stops_the_workers_and_sets_the_exit_code() {
-        for (name, code) in [("-INT", 130), ("-TERM", 143)] {
+        for (name, code) in [("-INT", 130), ("-TERM", 75)] {
             let folder = tempfile::tempdir().unwrap();
             let out = folder.path().join("out");
             let mut child = endless(&folder, &out);

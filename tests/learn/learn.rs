@@ -1,22 +1,25 @@
 //! Learning against independent truth: finite differences, autograd, a game of known value, and the
 //! budget over many trajectories of antagonists that nobody trained.
-#![cfg(feature = "torch")]
 
 use cvar_game::game::budget::{Budget, Eta};
 use cvar_game::game::finite::FiniteFamily;
 use cvar_game::game::gaussian::GaussianFamily;
 use cvar_game::options::{BumpBounds, Credit, PlayerOptions, Role, TrainOptions};
+use cvar_learn::adam::Adam;
 use cvar_learn::arena::Arena;
+use cvar_learn::checkpoint::TrainingState;
 use cvar_learn::contest::{Chance, Choosing};
 use cvar_learn::head::{AntagonistHead, CategoricalPolicy, GaussianPolicy, Head};
 use cvar_learn::network::{Network, Outputs, Shape};
 use cvar_learn::pair::Pair;
 use cvar_learn::play::{Play, play};
 use cvar_learn::ppo::{Loss, Sample};
-use cvar_learn::train::{Game, schedule, train};
+use cvar_learn::train::{Game, Training, schedule, train};
 use cvar_learn::weights;
 use lava_envs::law::{FiniteLaw, GaussianLaw, Law};
-use lava_envs::{End, Force, GridConfig, LavaGrid, LavaPoint, Move, PointConfig, Step, World};
+use lava_envs::{
+    End, Force, GridConfig, LavaGrid, LavaPoint, Move, NoSuchState, PointConfig, Step, World,
+};
 use nalgebra::Vector2;
 use rand::rngs::ChaCha8Rng;
 use rand::{RngExt, SeedableRng};
@@ -358,7 +361,7 @@ fn one_seed_gives_the_same_weights() {
     let run = || {
         let world = LavaGrid::new(&GridConfig::default(), 50).unwrap();
         let options = options();
-        let pair = train::<LavaGrid>(world, &game(&options, 25.0), |_, _| {}).unwrap();
+        let pair = train::<LavaGrid>(world, &game(&options, 25.0), |_| {}).unwrap();
         weights::to_bytes(&pair, String::new()).unwrap()
     };
     assert_eq!(run(), run());
@@ -413,9 +416,95 @@ fn a_learning_rate_that_diverges_is_diagnosed() {
     let mut options = options();
     options.protagonist.learning_rate = 1e30;
     let world = LavaGrid::new(&GridConfig::default(), 50).unwrap();
-    let error =
-        train::<LavaGrid>(world, &game(&options, 1.0), |_, _| {}).err().unwrap().to_string();
+    let error = train::<LavaGrid>(world, &game(&options, 1.0), |_| {}).err().unwrap().to_string();
     assert!(error.contains("of the protagonist is not finite at update"), "{error}");
+}
+
+/// With one minibatch per update no loss is looked at between the update and the next rollout, in
+/// which the world refuses an infinite push.
+#[test]
+fn players_that_diverge_in_their_last_minibatch_are_diagnosed_before_they_play() {
+    for (role, rate, expected) in [
+        (
+            Role::Protagonist,
+            1e3,
+            "a standard deviation of the protagonist is not finite at update 1",
+        ),
+        (
+            Role::Protagonist,
+            1e30,
+            "a network's output of the protagonist is not finite at update 1",
+        ),
+        (Role::Antagonist, 1e30, "a network's output of the antagonist is not finite at update 1"),
+    ] {
+        let mut options = options();
+        let rollout = options.rollout() as usize;
+        let player = match role {
+            Role::Protagonist => &mut options.protagonist,
+            Role::Antagonist => &mut options.antagonist,
+        };
+        (player.learning_rate, player.epochs, player.minibatch) = (rate, 1, rollout);
+        options.leader = role.other(); // the follower begins
+        let world = LavaPoint::new(&PointConfig::default(), options.parallel_episodes).unwrap();
+        let result = train::<LavaPoint>(world, &game(&options, 25.0), |_| {});
+        let error = result.err().unwrap().to_string();
+        assert!(error.contains(expected), "{error}");
+    }
+}
+
+/// Trains with and without a break after every update, which goes through the bytes of a file.
+fn breaks_change_nothing<W: Arena>(budget: f64, world: impl Fn() -> W) {
+    let mut options = options();
+    options.parallel_episodes = 20;
+    options.rollout_steps = 25; // episodes go on from rollout to rollout
+    options.steps = 500 * 8;
+    options.budget_wait = 0.1;
+    options.budget_rise = 0.4;
+    let game = game(&options, budget);
+    let mut whole = Training::new(world(), &game);
+    let mut state = postcard::to_allocvec(&whole.state()).unwrap();
+    loop {
+        let mut broken = Training::new(world(), &game);
+        broken.restore(postcard::from_bytes(&state).unwrap()).unwrap();
+        let (expected, found) = (whole.update().unwrap(), broken.update().unwrap());
+        assert_eq!(format!("{expected:?}"), format!("{found:?}"));
+        assert!(whole.state() == broken.state());
+        if found.is_none() {
+            break;
+        }
+        state = postcard::to_allocvec(&broken.state()).unwrap();
+    }
+    assert_eq!(whole.updates(), 8);
+}
+
+#[test]
+fn training_goes_on_from_its_state_bit_for_bit() {
+    for budget in [1.0, 25.0] {
+        breaks_change_nothing(budget, || LavaGrid::new(&GridConfig::default(), 20).unwrap());
+        breaks_change_nothing(budget, || LavaPoint::new(&PointConfig::default(), 20).unwrap());
+    }
+}
+
+#[test]
+fn a_state_of_another_game_is_refused() {
+    let world = |slots| LavaGrid::new(&GridConfig::default(), slots).unwrap();
+    let options = options();
+    let (paired, alone) = (game(&options, 25.0), game(&options, 1.0));
+    let state = Training::new(world(10), &paired).state();
+    let refused = |of: &Game<'_>, slots: usize, change: &dyn Fn(&mut TrainingState<_>)| {
+        let mut state = state.clone();
+        change(&mut state);
+        assert!(Training::new(world(slots), of).restore(state).is_err());
+    };
+    refused(&alone, 10, &|_| {});
+    refused(&paired, 11, &|_| {});
+    refused(&paired, 10, &|state| state.update = u64::MAX);
+    refused(&paired, 10, &|state| state.antagonist = None);
+    refused(&paired, 10, &|state| state.protagonist.parameters.push(0.0));
+    refused(&paired, 10, &|state| state.protagonist.parameters[0] = f32::NAN);
+    refused(&paired, 10, &|state| state.protagonist.optimiser = Adam::new(3));
+    refused(&paired, 10, &|state| state.games.slots[3].budget = 0.5);
+    refused(&paired, 10, &|state| state.games.slots[3].start = f64::INFINITY);
 }
 
 /// A two-step game of known value. Moving up at once pays `sure`. Any other move gambles: a fair coin
@@ -430,6 +519,7 @@ struct TwoCoins {
 impl World for TwoCoins {
     type Action = Move;
     type Law = FiniteLaw;
+    type Snapshot = (usize, bool);
     const OBSERVATION: usize = 2;
     const SITUATION: usize = 3;
 
@@ -441,6 +531,13 @@ impl World for TwoCoins {
     }
     fn reset(&mut self, slot: usize) {
         self.slots[slot] = (0, false);
+    }
+    fn snapshot(&self, slot: usize) -> (usize, bool) {
+        self.slots[slot]
+    }
+    fn restore(&mut self, slot: usize, snapshot: (usize, bool)) -> Result<(), NoSuchState> {
+        self.slots[slot] = snapshot;
+        Ok(())
     }
     fn time(&self, slot: usize) -> u32 {
         self.slots[slot].0 as u32
@@ -507,7 +604,7 @@ fn the_pair_learns_a_two_step_game_to_its_value() {
     }
     for (budget, sure, known) in [(1.0, -0.6, 0.25), (2.0, -0.6, -0.6), (2.0, -1.5, -1.0)] {
         let world = || TwoCoins { sure, slots: vec![(0, false); 100] };
-        let pair = train::<TwoCoins>(world(), &game(&options, budget), |_, _| {}).unwrap();
+        let pair = train::<TwoCoins>(world(), &game(&options, budget), |_| {}).unwrap();
         let chance = if budget == 1.0 { Chance::Nominal } else { Chance::Antagonist };
         let setting = Play {
             choosing: Choosing::Greedy,

@@ -1,6 +1,7 @@
 //! Layers of keys: reading, checking against the default's keys, merging.
 
 use super::{ConfigError, DEFAULT, WorldName, one_line, rules};
+use crate::experiment::artefacts::read_text;
 use std::path::Path;
 use toml::{Table, Value};
 
@@ -19,7 +20,7 @@ impl Layer {
     }
 
     pub fn read(path: &Path) -> Result<Layer, ConfigError> {
-        let text = std::fs::read_to_string(path)
+        let text = read_text(path)
             .map_err(|source| ConfigError::Read { path: path.to_owned(), source })?;
         Layer::parse(&path.display().to_string(), &text)
     }
@@ -53,6 +54,9 @@ impl Layer {
     }
 }
 
+/// More parts than any key has.
+const DEEPEST: usize = 16;
+
 /// One `key=value` from the command line.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Setting {
@@ -70,7 +74,8 @@ impl Setting {
         let refused = || ConfigError::Setting { setting: text.to_owned() };
         let (key, value) = text.split_once('=').ok_or_else(refused)?;
         let key: Vec<String> = key.split('.').map(|part| part.trim().to_owned()).collect();
-        if key.iter().any(String::is_empty) {
+        // No key is nested as deeply; reading one by one goes as deep as it is.
+        if key.len() > DEEPEST || key.iter().any(String::is_empty) {
             return Err(refused());
         }
         let value =

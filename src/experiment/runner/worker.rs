@@ -2,32 +2,49 @@
 //! numbers do not depend on how many run at once.
 //!
 //! A worker reads the `config.toml` of its folder and reports on standard output, one JSON object a
-//! line: `{"steps":..,"mean_return":..}`, or `{"failure":".."}` before it ends in vain. It never reads
-//! its standard input; that closes when the parent dies, however it dies, and the worker ends.
+//! line: `{"steps":..,"mean_return":..}`, `{"note":".."}`, or `{"failure":".."}` before it ends in vain.
+//! Its standard input says nothing and closes when the parent wants it to stop or dies, however it
+//! dies; the worker then ends with a checkpoint.
 
-use super::{Failure, LOG, Launcher, Stop, Tick};
+use super::{Failure, LOG, Launcher, Report, Stop, Tick};
 use crate::experiment::config::RunConfig;
+use crate::experiment::stop::{RESUME, exit_code};
 use serde::{Deserialize, Serialize};
+use signal_hook::consts::SIGTERM;
 use std::fs::File;
 use std::io::{self, BufRead, BufReader, Read, Write};
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, ExitStatus, Stdio};
 use std::sync::mpsc::{self, RecvTimeoutError};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 /// A line of a worker's standard output.
 #[derive(Debug, Serialize, Deserialize)]
 #[serde(untagged)]
-enum Report {
+enum Line {
     Tick(Tick),
+    Note { note: String },
     Failure { failure: String },
+}
+
+impl From<Report> for Line {
+    fn from(report: Report) -> Self {
+        match report {
+            Report::Tick(tick) => Line::Tick(tick),
+            Report::Note(note) => Line::Note { note },
+        }
+    }
 }
 
 /// Launches each run in a process of its own.
 #[derive(Debug, Clone)]
 pub struct Workers {
     program: PathBuf,
+    patience: Duration,
 }
+
+/// How long a worker may take over its checkpoint: Slurm kills 30 s after it asks to stop.
+const PATIENCE: Duration = Duration::from_secs(25);
 
 impl Workers {
     /// Workers that run this program again, as `worker --folder DIR`.
@@ -40,7 +57,12 @@ impl Workers {
 
     /// Workers that run another program in the same way.
     pub fn of(program: PathBuf) -> Self {
-        Workers { program }
+        Workers { program, patience: PATIENCE }
+    }
+
+    /// The same, killing a worker that does not end so long after it was asked to.
+    pub fn with_patience(self, patience: Duration) -> Self {
+        Workers { patience, ..self }
     }
 
     fn start(&self, folder: &Path) -> io::Result<Child> {
@@ -66,11 +88,12 @@ impl Launcher for Workers {
         _run: &RunConfig,
         folder: &Path,
         stop: &Stop,
-        tick: &mut dyn FnMut(Tick),
+        report: &mut dyn FnMut(Report),
     ) -> Result<(), Failure> {
         let failed = |error: io::Error| Failure::Failed(format!("cannot start a worker: {error}"));
         let mut worker = self.start(folder).map_err(failed)?;
-        let _alive = worker.stdin.take(); // closing it would end the worker
+        let mut input = worker.stdin.take(); // closing it stops the worker
+        let mut deadline = None;
         let output = BufReader::new(worker.stdout.take().expect("its output is piped"));
         let (sender, lines) = mpsc::channel();
         std::thread::spawn(move || {
@@ -83,15 +106,20 @@ impl Launcher for Workers {
         let mut told = None;
         loop {
             if stop.signal().is_some() {
-                // Its files appear in one piece, so it can be ended at any moment.
-                let _ = worker.kill();
-                let _ = worker.wait();
-                return Err(Failure::Stopped);
+                drop(input.take());
+                let deadline = *deadline.get_or_insert_with(|| Instant::now() + self.patience);
+                if Instant::now() >= deadline {
+                    // Its files appear in one piece; what it did since its checkpoint is lost.
+                    let _ = worker.kill();
+                    let _ = worker.wait();
+                    return Err(Failure::Unfinished);
+                }
             }
             match lines.recv_timeout(Duration::from_millis(50)) {
                 Ok(line) => match serde_json::from_str(&line) {
-                    Ok(Report::Tick(report)) => tick(report),
-                    Ok(Report::Failure { failure }) => told = Some(failure),
+                    Ok(Line::Tick(tick)) => report(Report::Tick(tick)),
+                    Ok(Line::Note { note }) => report(Report::Note(note)),
+                    Ok(Line::Failure { failure }) => told = Some(failure),
                     Err(_) => {} // a library that prints
                 },
                 Err(RecvTimeoutError::Timeout) => {}
@@ -106,6 +134,7 @@ impl Launcher for Workers {
         match told {
             Some(failure) => Err(Failure::Failed(failure)),
             None if status.success() => Ok(()),
+            None if status.code() == Some(i32::from(RESUME)) => Err(Failure::Unfinished),
             None => Err(Failure::Failed(describe(status, &log, folder))),
         }
     }
@@ -124,38 +153,44 @@ fn describe(status: ExitStatus, log: &str, folder: &Path) -> String {
     format!("its worker crashed ({status}) and said: {said}; see {}", folder.join(LOG).display())
 }
 
-/// The whole life of a worker process: carries out the run in `folder` and reports on standard
-/// output. Whether the run finished.
-pub fn work(folder: &Path, carry_out: CarryOut) -> bool {
-    std::thread::spawn(|| {
+/// The whole life of a worker process: carries out the run in `folder` and reports on standard output.
+/// Returns its exit code.
+pub fn work(folder: &Path, carry_out: CarryOut) -> u8 {
+    let stop = match Stop::on_signals() {
+        Ok(stop) => stop,
+        Err(error) => {
+            eprintln!("cannot listen to signals: {error}");
+            return 1;
+        }
+    };
+    let request = stop.clone();
+    std::thread::spawn(move || {
         let _ = io::stdin().read_to_end(&mut Vec::new());
-        // The parent is gone, and with it everyone who could use the result.
-        std::process::exit(1);
+        request.request(SIGTERM);
     });
-    let report = |report: &Report| {
-        let line = serde_json::to_string(report).expect("a report is representable as JSON");
+    let say = |line: &Line| {
+        let line = serde_json::to_string(line).expect("a line is representable as JSON");
         let mut output = io::stdout().lock();
-        // Fails when the parent is gone; the thread above then ends the process.
+        // Fails when the parent is gone; the thread above then stops the run.
         let _ = writeln!(output, "{line}").and_then(|()| output.flush());
     };
     let result = RunConfig::load(&folder.join("config.toml"))
-        .map_err(|error| error.to_string())
-        .and_then(|run| carry_out(&run, folder, &mut |tick| report(&Report::Tick(tick))));
+        .map_err(|error| Failure::Failed(error.to_string()))
+        .and_then(|run| carry_out(&run, folder, &stop, &mut |report| say(&report.into())));
     match result {
-        Ok(()) => true,
-        Err(failure) => {
-            report(&Report::Failure { failure });
-            false
+        Ok(()) => 0,
+        Err(Failure::Unfinished) => stop.signal().map_or(RESUME, exit_code),
+        Err(Failure::Failed(failure)) => {
+            say(&Line::Failure { failure });
+            1
         }
     }
 }
 
-/// How a run is carried out: trains and evaluates by the configuration, leaves the artefacts in the
-/// folder, and says in words why it failed.
-pub type CarryOut = fn(&RunConfig, &Path, &mut dyn FnMut(Tick)) -> Result<(), String>;
+/// How a run is carried out, as [`Launcher::launch`] says.
+pub type CarryOut = fn(&RunConfig, &Path, &Stop, &mut dyn FnMut(Report)) -> Result<(), Failure>;
 
-/// Carries out runs in this process. Cannot be stopped: whoever uses it leaves signals to end the
-/// process.
+/// Carries out runs in this process.
 #[derive(Debug, Clone, Copy)]
 pub struct InProcess(pub CarryOut);
 
@@ -164,9 +199,9 @@ impl Launcher for InProcess {
         &self,
         run: &RunConfig,
         folder: &Path,
-        _stop: &Stop,
-        tick: &mut dyn FnMut(Tick),
+        stop: &Stop,
+        report: &mut dyn FnMut(Report),
     ) -> Result<(), Failure> {
-        (self.0)(run, folder, tick).map_err(Failure::Failed)
+        (self.0)(run, folder, stop, report)
     }
 }

@@ -180,7 +180,7 @@ fn training<W: Bench>(criterion: &mut Criterion) {
         bencher.iter_batched(
             || W::build(&options),
             |world| {
-                train(world, &game, |progress, _| {
+                train(world, &game, |progress| {
                     black_box(progress);
                 })
             },

@@ -15,7 +15,9 @@ use crate::weights;
 use cvar_game::exact::antagonist::WorstCase;
 use cvar_game::exact::grid::ExactGrid;
 use cvar_game::exact::policy::Policy;
-use cvar_game::experiment::artefacts::{Audit, Certificate, Chance, Mode, Play};
+use cvar_game::experiment::artefacts::{
+    Audit, Certificate, Chance, LARGEST_FILE, Mode, Play, read_at_most,
+};
 use cvar_game::experiment::config::{Device, RunConfig, WorldConfig};
 use lava_envs::law::{FiniteLaw, MOVES, sample_index};
 use lava_envs::random::ChaCha8Rng;
@@ -272,7 +274,7 @@ pub(super) fn play_run<W: Yardstick>(
 /// The trained pair of a finished run.
 pub(super) fn load<W: Arena>(run: &RunConfig, folder: &Path) -> Result<Pair<W>, RunError> {
     let path = folder.join("final.safetensors");
-    let bytes = std::fs::read(&path).map_err(RunError::file(&path))?;
+    let bytes = read_at_most(&path, LARGEST_FILE).map_err(RunError::file(&path))?;
     let device = device(run.device);
     let mut pair = Pair::<W>::new(&run.train, run.eta, run.seed, device);
     weights::load(&mut pair, &bytes, device)?;

@@ -81,7 +81,7 @@ pub struct Recorded<W: Yardstick> {
     ratio: f64,
 }
 
-/// Plays for all exhibits of a trained pair; `regret` was measured in training.
+/// Plays for all exhibits of a trained pair.
 ///
 /// # Errors
 /// If the world refuses its constants or cannot be solved.
@@ -89,7 +89,6 @@ pub fn exhibits<W: Exhibited>(
     run: &RunConfig,
     constants: &W::Constants,
     pair: &Pair<W>,
-    regret: Vec<(u64, f64)>,
 ) -> Result<Exhibits, RunError> {
     let mut setting = run.clone();
     let antagonist = pair.antagonist.is_some();
@@ -117,7 +116,6 @@ pub fn exhibits<W: Exhibited>(
         world: W::exhibit(constants, run, pair, counts, &nominal.first)?,
         budget,
         stored,
-        regret: regret.into_iter().map(|(steps, regret)| (steps, rounded(regret))).collect(),
     })
 }
 

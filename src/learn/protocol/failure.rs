@@ -32,6 +32,9 @@ pub enum RunError {
     /// The output takes no more.
     #[error("cannot write the steps: {0}")]
     Output(io::Error),
+    /// It was asked to stop, or another process works on it.
+    #[error("not finished yet; start it again to go on from its last checkpoint")]
+    Unfinished,
     /// There is no such antagonist.
     #[error("{0}")]
     NoOpponent(&'static str),

@@ -49,6 +49,7 @@ impl Progress {
             Event::Failed { run, seconds, reason } => {
                 self.end(&format!("{run} failed after {}: {reason}", time(*seconds)));
             }
+            Event::Noted { run, note } => self.line(&format!("{run}: {note}")),
             Event::Stopped { run } => self.line(&format!("{run} stopped")),
             Event::Started { .. } | Event::Ticked { .. } => {}
         }
@@ -88,6 +89,7 @@ impl Bars {
     fn event(&mut self, event: &Event) {
         match event {
             Event::Started { run, steps } => {
+                self.active.retain(|(active, _)| active != run); // a run that is tried again
                 let bar = self.all.insert_before(&self.sweep, ProgressBar::new(*steps));
                 bar.set_style(style("{prefix} [{bar:30}] {percent:>3} % {msg}"));
                 bar.set_prefix(run.to_string());
@@ -103,6 +105,7 @@ impl Bars {
                     ));
                 }
             }
+            Event::Noted { .. } => {}
             Event::Finished { run, .. } | Event::Failed { run, .. } | Event::Stopped { run } => {
                 self.active.retain(|(active, bar)| {
                     if active == run {

@@ -35,7 +35,8 @@ pub(super) fn colour(place: usize) -> RGBColor {
 
 /// A magnitude in [0, 1] as a colour: viridis, from dark to bright.
 pub(super) fn heat(share: f64) -> RGBColor {
-    ViridisRGB::get_color(share.clamp(0.0, 1.0))
+    // A share of nothing is none.
+    ViridisRGB::get_color(share.max(0.0).min(1.0))
 }
 
 /// Black or white, whichever can be read on a colour.
@@ -73,7 +74,7 @@ pub(super) fn span(values: impl Iterator<Item = f64>) -> Option<std::ops::Range<
     let (low, high) = values
         .filter(|value| value.is_finite())
         .fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), v| (low.min(v), high.max(v)));
-    let air = 0.05 * (high - low).max(0.02);
+    let air = 0.05 * (high - low).max(0.02).max(1e-3 * low.abs().max(high.abs()));
     (low <= high).then_some(low - air..high + air)
 }
 

@@ -6,6 +6,7 @@ use super::canvas::{
 };
 use crate::exact::grid::ExactGrid;
 use crate::experiment::exhibits::WorldExhibit;
+use crate::report::archive::Update;
 use crate::report::group::ALPHAS;
 use lava_envs::GridConfig;
 use plotters::prelude::*;
@@ -87,7 +88,7 @@ pub(super) fn learning(panels: &[Panel]) -> Option<(String, String)> {
             .map(|(_, archive)| {
                 let updates = &archive.progress;
                 let width = updates.len().div_ceil(BINS).max(1);
-                let bin = |bin: &[crate::report::archive::Update]| {
+                let bin = |bin: &[Update]| {
                     let returns: Vec<f64> =
                         bin.iter().map(|of| of.mean_return).filter(|of| of.is_finite()).collect();
                     let mean = returns.iter().sum::<f64>() / returns.len() as f64;
@@ -108,9 +109,9 @@ pub(super) fn learning(panels: &[Panel]) -> Option<(String, String)> {
 
 pub(super) fn regret(panels: &[Panel]) -> Option<(String, String)> {
     let of_panel = |panel: &Panel| {
-        let exhibits = panel.archives.iter().filter_map(|(_, archive)| archive.exhibits.as_ref());
-        let seeds: Vec<Vec<(f64, f64)>> = exhibits
-            .map(|of| of.regret.iter().map(|&(steps, regret)| (steps as f64, regret)).collect())
+        let point = |update: &Update| Some((update.steps, update.regret?));
+        let seeds: Vec<Vec<(f64, f64)>> = (panel.archives.iter())
+            .map(|(_, archive)| archive.progress.iter().filter_map(point).collect())
             .collect();
         over_seeds(&seeds)
     };

@@ -1,0 +1,28 @@
+//! The lock of a run's folder: one process at a time works on a run.
+
+use std::fs::{File, OpenOptions, TryLockError};
+use std::io;
+use std::path::Path;
+
+/// Held by the process that carries out a run. The system releases it when that process ends, however
+/// it ends, so no lock is ever left behind; the empty file `.lock` is.
+#[derive(Debug)]
+pub struct RunLock {
+    _file: File,
+}
+
+impl RunLock {
+    /// Takes the lock of a run's folder; `None` while another process has it.
+    ///
+    /// # Errors
+    /// If the folder cannot be written or its file system has no locks.
+    pub fn take(folder: &Path) -> io::Result<Option<RunLock>> {
+        let path = folder.join(".lock");
+        let file = OpenOptions::new().create(true).truncate(false).write(true).open(path)?;
+        match file.try_lock() {
+            Ok(()) => Ok(Some(RunLock { _file: file })),
+            Err(TryLockError::WouldBlock) => Ok(None),
+            Err(TryLockError::Error(error)) => Err(error),
+        }
+    }
+}

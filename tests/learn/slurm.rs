@@ -1,0 +1,207 @@
+//! A sweep on a real Slurm: munged, slurmctld and slurmd on this machine alone.
+//!
+//! Needs root and the packages slurm-wlm and munge. `cargo test --test slurm -- --ignored`
+#![cfg(unix)]
+
+use assert_cmd::cargo::cargo_bin;
+use std::fs;
+use std::os::unix::fs::PermissionsExt;
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, Output, Stdio};
+use std::time::{Duration, Instant};
+use tempfile::TempDir;
+
+/// Daemons in a folder of their own; they end with it.
+struct Cluster {
+    folder: TempDir,
+    daemons: Vec<Child>,
+}
+
+impl Drop for Cluster {
+    fn drop(&mut self) {
+        // Slurm before munge.
+        for daemon in self.daemons.iter_mut().rev() {
+            let _ = Command::new("kill").arg(daemon.id().to_string()).status();
+            let _ = daemon.wait();
+        }
+    }
+}
+
+impl Cluster {
+    fn start() -> Self {
+        let folder = tempfile::tempdir().unwrap();
+        let mut cluster = Cluster { folder, daemons: Vec::new() };
+        let key: Vec<u8> = (0..128).collect(); // guards a cluster of one machine for a minute
+        fs::write(cluster.path("munge.key"), key).unwrap();
+        let private = fs::Permissions::from_mode(0o600);
+        fs::set_permissions(cluster.path("munge.key"), private).unwrap();
+        for name in ["state", "spool"] {
+            fs::create_dir(cluster.path(name)).unwrap();
+        }
+        fs::write(cluster.path("slurm.conf"), cluster.configuration()).unwrap();
+
+        let root = cluster.folder.path().to_owned();
+        let path = |name: &str| root.join(name).to_str().unwrap().to_owned();
+        let munge = [
+            "--foreground".to_owned(),
+            "--force".to_owned(),
+            format!("--socket={}", path("munge.socket")),
+            format!("--key-file={}", path("munge.key")),
+            format!("--pid-file={}", path("munge.pid")),
+            format!("--log-file={}", path("munge.log")),
+            format!("--seed-file={}", path("munge.seed")),
+        ];
+        let munged = cluster.daemon("munged", &munge);
+        cluster.daemons.push(munged);
+        cluster.until("munge", || cluster.path("munge.socket").exists());
+        let configuration = ["-D".to_owned(), "-f".to_owned(), path("slurm.conf")];
+        for program in ["slurmctld", "slurmd"] {
+            let daemon = cluster.daemon(program, &configuration);
+            cluster.daemons.push(daemon);
+        }
+        cluster.until("an idle node", || cluster.ask("sinfo", &["-h", "-o", "%T"]) == "idle\n");
+        cluster
+    }
+
+    fn configuration(&self) -> String {
+        let name = fs::read_to_string("/proc/sys/kernel/hostname").unwrap();
+        let name = name.trim();
+        let [controller, node] = [free_port(), free_port()];
+        let cores = std::thread::available_parallelism().unwrap();
+        let path = |file: &str| self.path(file).display().to_string();
+        // A requeued task waits until its old credential has expired, by default two minutes.
+        format!(
+            "ClusterName=drill\nSlurmctldHost={name}(127.0.0.1)\nSlurmUser=root\nSlurmdUser=root\n\
+             AuthType=auth/munge\nAuthInfo=socket={},cred_expire=5\nCryptoType=crypto/munge\n\
+             ProctrackType=proctrack/linuxproc\nTaskPlugin=task/none\n\
+             SelectType=select/cons_tres\nSelectTypeParameters=CR_CPU\n\
+             SlurmctldPort={controller}\nSlurmdPort={node}\nReturnToService=2\nMpiDefault=none\n\
+             StateSaveLocation={}\nSlurmdSpoolDir={}\nSlurmctldPidFile={}\nSlurmdPidFile={}\n\
+             SlurmctldLogFile={}\nSlurmdLogFile={}\nSchedulerParameters=bf_interval=1,sched_interval=1\n\
+             NodeName={name} NodeAddr=127.0.0.1 CPUs={cores} State=UNKNOWN\n\
+             PartitionName=only Nodes={name} Default=YES State=UP\n",
+            path("munge.socket"),
+            path("state"),
+            path("spool"),
+            path("slurmctld.pid"),
+            path("slurmd.pid"),
+            path("slurmctld.log"),
+            path("slurmd.log"),
+        )
+    }
+
+    fn path(&self, name: &str) -> PathBuf {
+        self.folder.path().join(name)
+    }
+
+    fn command(&self, program: impl AsRef<std::ffi::OsStr>) -> Command {
+        let mut command = Command::new(program);
+        command.env("SLURM_CONF", self.path("slurm.conf")).stdin(Stdio::null());
+        command
+    }
+
+    fn daemon(&self, program: &str, arguments: &[String]) -> Child {
+        let log = fs::File::create(self.path(&format!("{program}.out"))).unwrap();
+        let mut command = self.command(Path::new("/usr/sbin").join(program));
+        command.args(arguments).stdout(log.try_clone().unwrap()).stderr(log);
+        command.spawn().unwrap_or_else(|error| panic!("{program}: {error}; is slurm-wlm there?"))
+    }
+
+    fn ask(&self, program: &str, arguments: &[&str]) -> String {
+        let output = self.command(program).args(arguments).output().unwrap();
+        String::from_utf8(output.stdout).unwrap()
+    }
+
+    fn until(&self, what: &str, condition: impl Fn() -> bool) {
+        let start = Instant::now();
+        while !condition() {
+            if start.elapsed() > Duration::from_secs(120) {
+                for log in ["munged.out", "slurmctld.log", "slurmd.log"] {
+                    let text = fs::read_to_string(self.path(log)).unwrap_or_default();
+                    eprintln!("--- {log}\n{text}");
+                }
+                panic!("waited in vain for {what}");
+            }
+            std::thread::sleep(Duration::from_millis(200));
+        }
+    }
+}
+
+fn free_port() -> u16 {
+    std::net::TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port()
+}
+
+const CONFIG: &str = r#"
+[experiment]
+etas = [1, 25]
+seeds = [1, 2]
+[train]
+steps = 600_000
+[checkpoint]
+every = 5
+[evaluation]
+episodes = 500
+exhibit_episodes = 500
+"#;
+
+fn run(command: &mut Command) -> Output {
+    let output = command.output().unwrap();
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    output
+}
+
+fn table(out: &Path) -> String {
+    let text = fs::read_to_string(out.join("table.csv")).unwrap();
+    let columns = |line: &str| line.split(',').map(str::to_owned).collect::<Vec<_>>();
+    let header = columns(text.lines().next().unwrap());
+    let kept = |column: usize| !header[column].contains("second");
+    let mut lines = Vec::new();
+    for line in text.lines() {
+        let row = columns(line);
+        lines.push((0..row.len()).filter(|&i| kept(i)).map(|i| row[i].clone()).collect::<Vec<_>>());
+    }
+    lines.into_iter().map(|row| row.join(",") + "\n").collect()
+}
+
+#[test]
+#[ignore = "needs root, slurm-wlm and munge"]
+fn an_array_with_a_task_that_is_stopped_and_requeued_ends_in_the_table_of_bench() {
+    let cluster = Cluster::start();
+    // A name that a careless script would take apart.
+    let folder = cluster.path("the user's 100% folder");
+    fs::create_dir(&folder).unwrap();
+    let config = folder.join("drill.toml");
+    fs::write(&config, CONFIG).unwrap();
+    let (out, expected) = (folder.join("out"), folder.join("expected"));
+    let program = |verb: &str, out: &Path| {
+        let mut command = cluster.command(cargo_bin("cvar-game"));
+        command.arg(verb).arg("--config").arg(&config).arg("--out").arg(out);
+        command
+    };
+    let submitted = run(program("slurm", &out).args(["--array-limit", "2", "--submit"]));
+    let told = String::from_utf8(submitted.stdout).unwrap();
+    let job = told.split_whitespace().nth(3).unwrap().trim_end_matches(',').to_owned();
+
+    let runs = fs::read_to_string(out.join("slurm/runs.txt")).unwrap();
+    let first = out.join(runs.lines().next().unwrap());
+    cluster.until("a checkpoint", || first.join("checkpoint-5.bin").exists());
+    let task = format!("{job}_0");
+    // It repeats itself while the task is on its way back into the queue.
+    let mut scancel = cluster.command("scancel");
+    let mut scancel = scancel.args(["--batch", "--signal=TERM", &task]).spawn().unwrap();
+    let log = out.join(format!("slurm/{job}_0.log"));
+    let logged = || fs::read_to_string(&log).unwrap_or_default();
+    cluster.until("the requeued task", || logged().contains("goes on after update"));
+    assert!(logged().contains("the same command goes on"), "{}", logged());
+    let _ = scancel.kill();
+    scancel.wait().unwrap();
+
+    cluster.until("the end of all jobs", || cluster.ask("squeue", &["-h"]).is_empty());
+    let made = fs::read_to_string(out.join("slurm/table.log")).unwrap();
+    assert!(made.contains("lava-point"), "{made}");
+    run(&mut program("bench", &expected));
+    assert_eq!(table(&out), table(&expected));
+    // Nothing is left to submit.
+    let again = run(program("slurm", &out).arg("--submit"));
+    assert!(String::from_utf8(again.stdout).unwrap().starts_with("all runs are finished"));
+}
