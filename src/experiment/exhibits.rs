@@ -96,7 +96,7 @@ pub struct GridExhibit {
     pub learned: Option<Deviations>,
     /// Under the exact worst-case antagonist, expected of as many trajectories.
     pub exact: Option<Deviations>,
-    /// E[log eta_t] / log eta by time under the exact worst-case antagonist, of running episodes.
+    /// `E[log eta_t]` / log eta by time under the exact worst-case antagonist, of running episodes.
     pub exact_budget: Vec<f64>,
 }
 

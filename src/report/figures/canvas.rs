@@ -36,7 +36,7 @@ pub(super) fn colour(place: usize) -> RGBColor {
 /// A magnitude in [0, 1] as a colour: viridis, from dark to bright.
 pub(super) fn heat(share: f64) -> RGBColor {
     // A share of nothing is none.
-    ViridisRGB::get_color(share.max(0.0).min(1.0))
+    ViridisRGB::get_color(if share.is_nan() { 0.0 } else { share.clamp(0.0, 1.0) })
 }
 
 /// Black or white, whichever can be read on a colour.
