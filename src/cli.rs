@@ -88,6 +88,8 @@ pub enum PlayVerb {
 pub enum LookVerb {
     Exact(ExactArgs),
     Table(TableArgs),
+    Figures(FiguresArgs),
+    Report(ReportArgs),
     Slurm(SlurmArgs),
     Envs(EnvsArgs),
     Config(PrintArgs),
@@ -307,13 +309,38 @@ pub struct ExactArgs {
 
 /// Make the table of results of a folder again and print it.
 #[derive(Debug, Args)]
+#[command(after_help = "\
+Examples:
+  cvar-game table results/quick
+  cvar-game table results/paper --compare results/ablations/executed --compare my-method")]
 pub struct TableArgs {
     /// Output folder of `bench` or `train`.
     #[arg(value_name = "DIR")]
     pub folder: PathBuf,
+    /// Another such folder, to be put beside DIR in comparison.md, .csv and .tex. May be repeated.
+    #[arg(long, value_name = "DIR")]
+    pub compare: Vec<PathBuf>,
     /// Print the table as JSON and write nothing.
     #[arg(long)]
     pub json: bool,
+}
+
+/// Draw the figures of a results folder into its subfolder `figures`, as SVG and PNG.
+#[derive(Debug, Args)]
+pub struct FiguresArgs {
+    /// Output folder of `bench` or `train`.
+    #[arg(value_name = "DIR")]
+    pub folder: PathBuf,
+}
+
+/// Write everything about a results folder anew: tables, figures and report.html.
+///
+/// The page needs no network and no other file.
+#[derive(Debug, Args)]
+pub struct ReportArgs {
+    /// Output folder of `bench` or `train`.
+    #[arg(value_name = "DIR")]
+    pub folder: PathBuf,
 }
 
 /// Hand a sweep to Slurm: a job array with one task per run, then a job that makes the table.
@@ -442,6 +469,8 @@ pub fn look(verb: LookVerb) -> Result<ExitCode> {
     match verb {
         LookVerb::Exact(args) => exact(&args),
         LookVerb::Table(args) => table(&args),
+        LookVerb::Figures(args) => figures(&args),
+        LookVerb::Report(args) => report(&args.folder),
         LookVerb::Slurm(args) => slurm(&args),
         LookVerb::Envs(args) => envs(&args),
         LookVerb::Config(args) => {
@@ -487,9 +516,35 @@ fn exact(args: &ExactArgs) -> Result<ExitCode> {
 
 fn table(args: &TableArgs) -> Result<ExitCode> {
     if args.json {
-        answer::print_json(&report::table_json(&args.folder)?)
+        return answer::print_json(&report::table_json(&args.folder, &args.compare)?);
+    }
+    answer::print(&if args.compare.is_empty() {
+        report::write(&args.folder)?
     } else {
-        answer::print(&report::write(&args.folder)?)
+        report::write_comparison(&args.folder, &args.compare)?
+    })
+}
+
+fn figures(args: &FiguresArgs) -> Result<ExitCode> {
+    let figures = report::write_figures(&args.folder)?;
+    tell_missing(&figures);
+    answer::print(&format!(
+        "{} figures written to {}",
+        figures.drawn.len(),
+        args.folder.join("figures").display()
+    ))
+}
+
+fn report(folder: &Path) -> Result<ExitCode> {
+    let written = report::write_all(folder)?;
+    tell_missing(&written.figures);
+    answer::print(&folder.join("report.html").display().to_string())
+}
+
+/// Says which figures the artefacts did not allow.
+fn tell_missing(figures: &report::figures::Figures) {
+    if !figures.missing.is_empty() {
+        eprintln!("left out, for want of artefacts: {}", figures.missing.join("; "));
     }
 }
 

@@ -239,3 +239,49 @@ proptest! {
         prop_assert!((antagonist.value() - best).abs() < 1e-9);
     }
 }
+
+/// Where the worst case makes moves slip, against episodes played in the world.
+#[test]
+fn exposure_to_the_worst_case_is_what_played_episodes_meet() {
+    let exact = ExactGrid::new(&GridConfig::default(), 1.0).unwrap();
+    let policy = exact.optimum(1.0).unwrap().policy;
+    let eta: f64 = 25.0;
+    let worst = exact.worst_case(&policy, eta).unwrap();
+    let exposure = exact.exposure(&policy, &worst);
+    let cells = exact.grid().cells();
+    let counted =
+        std::cell::RefCell::new((vec![0.0; cells], vec![0.0; cells], vec![(0.0, 0.0); 40]));
+    let episodes = 50_000;
+    let law = simulate(&exact, &policy, episodes, |time, cell, action, law| {
+        let node = exact.node(time, cell);
+        let mut perturbed = law;
+        for (outcome, p) in perturbed.probabilities.iter_mut().enumerate() {
+            *p *= worst.delta(node, action.index(), outcome);
+        }
+        let (visits, deviations, budget) = &mut *counted.borrow_mut();
+        visits[cell] += 1.0;
+        deviations[cell] += 1.0 - perturbed.probabilities[action.index()];
+        budget[time as usize].0 += worst.remaining_budget(node).ln() / eta.ln();
+        budget[time as usize].1 += 1.0;
+        perturbed
+    });
+    let played = law.episodes().unwrap() as f64;
+    let (visits, deviations, budget) = counted.into_inner();
+    for cell in 0..cells {
+        // Visits of one episode scatter like their number at most, and a little for those of none.
+        let error = 5.0 * (2.0 * exposure.visits[cell].max(1e-3) / played).sqrt();
+        for (name, found, expected) in [
+            ("visits", visits[cell], exposure.visits[cell]),
+            ("deviations", deviations[cell], exposure.deviations[cell]),
+        ] {
+            let found = found / played;
+            assert!((found - expected).abs() < error, "{name} of {cell}: {found}, not {expected}");
+        }
+    }
+    for (time, expected) in exposure.budget.iter().take(15).enumerate() {
+        let found = budget[time].0 / budget[time].1;
+        assert!((found - expected).abs() < 0.02, "budget at {time}: {found}, not {expected}");
+    }
+    let share = |cells: &[f64]| cells.iter().sum::<f64>();
+    assert!(share(&exposure.deviations) > 1.5 * 0.05 * share(&exposure.visits));
+}

@@ -139,7 +139,7 @@ fn evaluations(effort: (u32, Duration)) -> u64 {
         fs::write(folder.join("evaluation.json"), bytes).unwrap();
         let _ = runner::read_evaluation(&folder);
         if report::write(out.path()).is_ok() {
-            report::table_json(out.path()).unwrap();
+            report::table_json(out.path(), &[]).unwrap();
         }
     })
 }

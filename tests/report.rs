@@ -384,7 +384,7 @@ fn a_leaking_or_violated_budget_is_shouted() {
 fn json_has_every_row_and_says_null_where_there_is_no_number() {
     let dir = tempfile::tempdir().unwrap();
     realistic(dir.path());
-    let value = report::table_json(dir.path()).unwrap();
+    let value = report::table_json(dir.path(), &[]).unwrap();
     assert_eq!(value["schema"], SCHEMA);
     let rows = value["worlds"][0]["rows"].as_array().unwrap();
     assert_eq!(rows.len(), 3);
@@ -488,4 +488,69 @@ fn a_folder_without_runs_says_what_is_expected() {
     assert!(error.to_string().contains("in progress"), "{error}");
     let error = report::write(&dir.path().join("nowhere")).unwrap_err();
     assert!(matches!(error, ReportError::Read { .. }) && error.to_string().contains("nowhere"));
+}
+
+/// The folder beside itself with three seeds worse and one method of another program.
+#[test]
+fn folders_are_put_side_by_side() {
+    let (ours, theirs) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
+    let (ours, theirs) = (ours.path().join("ours"), theirs.path().join("theirs"));
+    for (dir, lost) in [(&ours, [1, 2, 3]), (&theirs, [11, 12, 13])] {
+        for (seed, lost) in (1..).zip(lost) {
+            let folder = folder(dir, "lava-point", 2.0, seed);
+            let mut text = "steps,end,return,clearance\n".to_owned();
+            text += &"1,lava,-1,0\n".repeat(lost);
+            text += &"1,goal,1,0.5\n".repeat(100 - lost);
+            fs::write(folder.join("episodes.csv"), text).unwrap();
+        }
+    }
+    let terminal = report::write_comparison(&ours, std::slice::from_ref(&theirs)).unwrap();
+    let rows = csv(&ours, "comparison.csv");
+    let (first, second) = (row(&rows, &[("folder", "ours")]), row(&rows, &[("folder", "theirs")]));
+    // An episode of 100 between -1 and 1 moves CVaR_{1/2} by 0.04; ten more are lost at every seed.
+    assert_eq!((first["cvar"].as_str(), second["cvar"].as_str()), ("0.920000", "0.520000"));
+    assert_eq!(
+        (second["versus"].as_str(), second["versus_lo"].as_str()),
+        ("-0.400000", "-0.400000")
+    );
+    assert_eq!(
+        (second["versus_pairs"].as_str(), second["versus_improvement"].as_str()),
+        ("3", "0.000000")
+    );
+    assert_eq!(first["versus"], "");
+    assert_eq!(first["clearance"], "0.490000");
+    for said in ["against the first results folder", "0.920*", "0.520 "] {
+        assert!(terminal.contains(said), "{said} is not in\n{terminal}");
+    }
+    let latex = fs::read_to_string(ours.join("comparison.tex")).unwrap();
+    assert!(latex.contains("\\textbf{0.920}") && !latex.contains("\\textbf{0.520}"), "{latex}");
+    fs::write(theirs.join("lava-point/eta-2/seed-2/episodes.csv"), "return,steps\n1,2\n").unwrap();
+    let error = report::write_comparison(&ours, &[theirs]).unwrap_err().to_string();
+    assert!(error.contains("episodes.csv") && error.contains("missing field `end`"), "{error}");
+}
+
+/// With TeX Live's pdflatex (Debian: texlive-latex-base, texlive-latex-recommended).
+#[test]
+#[ignore = "needs pdflatex"]
+fn the_latex_tables_compile_and_fit() {
+    let dir = tempfile::tempdir().unwrap();
+    realistic_of(dir.path(), 10);
+    manifest(dir.path(), "lava-grid", 25.0, 11, Some("100 % of \\ {broken} $ & _ # ~ ^"));
+    report::write(dir.path()).unwrap();
+    report::write_comparison(
+        dir.path(),
+        &[dir.path().join("../").join(dir.path().file_name().unwrap())],
+    )
+    .unwrap();
+    let document = "\\documentclass{article}\\usepackage{booktabs,graphicx}\\begin{document}\n\
+                    \\input{table}\\input{comparison}\n\\end{document}\n";
+    fs::write(dir.path().join("paper.tex"), document).unwrap();
+    let output = std::process::Command::new("pdflatex")
+        .args(["-halt-on-error", "paper.tex"])
+        .current_dir(dir.path())
+        .output()
+        .unwrap();
+    let log = String::from_utf8_lossy(&output.stdout);
+    assert!(output.status.success(), "{log}");
+    assert!(!log.contains("Overfull"), "{log}");
 }

@@ -7,6 +7,7 @@
 use super::antagonist::WorstCase;
 use super::certificate::{Certificate, Risk};
 use super::chow::Chow;
+use super::law::forward;
 use super::mdp::{FiniteMdp, Node, Outcome, State};
 use super::optimum::{Optimum, optimum};
 use super::policy::Policy;
@@ -118,6 +119,30 @@ impl ExactGrid {
         WorstCase::new(&self.mdp, policy, eta)
     }
 
+    /// What a deterministic policy meets under its worst-case antagonist, whose budget is above 1.
+    pub fn exposure(&self, policy: &Policy, worst: &WorstCase) -> Exposure {
+        let cells = self.grid.cells();
+        let (mut visits, mut deviations) = (vec![0.0; cells], vec![0.0; cells]);
+        let (mut budget, mut running) =
+            (vec![0.0; self.mdp.horizon()], vec![0.0; self.mdp.horizon()]);
+        let on_visit = |node: Option<Node>, cell: usize, mass: f64| {
+            let Some(node) = node else { return };
+            let chosen = policy.action(&self.mdp, node);
+            let kept = self.grid.law_of(Move::from_index(chosen)).probabilities[chosen]
+                * worst.delta(node, chosen, chosen);
+            visits[cell] += mass;
+            deviations[cell] += mass * (1.0 - kept);
+            running[node.time] += mass;
+            budget[node.time] += mass * worst.remaining_budget(node).ln();
+        };
+        forward(&self.mdp, policy, worst, |_, _, _, _, _| {}, on_visit);
+        let share = |(sum, mass): (f64, f64)| sum / mass / worst.eta().ln();
+        let reached = running.iter().take_while(|mass| **mass > 0.0).count();
+        budget.truncate(reached);
+        let budget = budget.into_iter().zip(running).map(share).collect();
+        Exposure { visits, deviations, budget }
+    }
+
     /// Solves everything at one budget.
     ///
     /// # Errors
@@ -170,6 +195,17 @@ impl ExactGrid {
         }
         path
     }
+}
+
+/// Expectations over the episodes of a policy under its worst-case antagonist.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Exposure {
+    /// Steps that begin in each cell.
+    pub visits: Vec<f64>,
+    /// Those of them whose executed move is not the chosen one.
+    pub deviations: Vec<f64>,
+    /// Mean of log eta_t / log eta over the episodes that still run at time t, as long as one does.
+    pub budget: Vec<f64>,
 }
 
 fn outcomes(grid: &LavaGrid, cell: usize, chosen: Move) -> Vec<Outcome> {

@@ -7,7 +7,9 @@
 //! | `config.toml` | the resolved configuration of the run |
 //! | `manifest.json` | [`Manifest`]: where the run comes from |
 //! | `progress.csv` | one line per update of a player |
+//! | `events.out.tfevents.cvar-game` | the same for TensorBoard ([`super::tensorboard`]) |
 //! | `final.safetensors` | weights of both players at the end, never the best |
+//! | `exhibits.json` | [`super::exhibits`]: what figures need beyond numbers |
 //! | `checkpoint-<update>.bin` | what an unfinished run goes on from, see [`super::checkpoint`] |
 //! | `evaluation.json` | [`Evaluation`]; written last, so that a run with it is finished |
 

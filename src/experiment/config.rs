@@ -195,6 +195,15 @@ pub struct EvaluationOptions {
     pub seed: u64,
     /// Levels at which CVaR is reported.
     pub alphas: Vec<f64>,
+    /// Episodes played against the antagonist for the figures; runs of former versions have no such
+    /// key.
+    #[serde(default = "exhibit_episodes")]
+    pub exhibit_episodes: u64,
+}
+
+/// The default of [`EvaluationOptions::exhibit_episodes`].
+fn exhibit_episodes() -> u64 {
+    300_000
 }
 
 /// The constants of a world.

@@ -6,7 +6,7 @@
 //! | what are worlds and runs called | [`names`] |
 //! | which runs does a configuration mean | [`plan`] |
 //! | how are they carried out, many at a time | [`runner`] |
-//! | what does a run leave behind | [`artefacts`] |
+//! | what does a run leave behind | [`artefacts`], [`exhibits`], [`tensorboard`] |
 //! | what does an unfinished one go on from | [`checkpoint`] |
 //! | who may work on a run, and what stops it | [`lock`], [`stop`] |
 //! | how does a sweep go to Slurm | [`slurm`] |
@@ -14,9 +14,11 @@
 pub mod artefacts;
 pub mod checkpoint;
 pub mod config;
+pub mod exhibits;
 pub mod lock;
 pub mod names;
 pub mod plan;
 pub mod runner;
 pub mod slurm;
 pub mod stop;
+pub mod tensorboard;

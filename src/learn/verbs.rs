@@ -79,7 +79,8 @@ fn bench(args: &BenchArgs) -> Result<ExitCode> {
     let any_finished = outcome.finished + prepared.finished.len() > 0;
     let code = tell_end(&outcome);
     if outcome.stopped.is_none() && args.only.is_none() && any_finished {
-        print(&report::write(&out)?)?;
+        let written = report::write_all(&out)?;
+        print(&written.table)?;
         eprintln!("written to {}", out.display());
     }
     Ok(code)

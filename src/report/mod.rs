@@ -5,24 +5,34 @@
 //! | file | what | one row per |
 //! |---|---|---|
 //! | `runs.csv` | the numbers of the runs ([`runs`]) | run |
-//! | `table.csv`, `table.md` | statistics over seeds with intervals ([`table`]) | world and eta |
+//! | `table.csv`, `table.md`, `table.tex` | statistics over seeds with intervals ([`table`]) | world and eta |
 //! | `cross.csv` | greedy CVaR of every policy at every alpha ([`cross`]) | world, eta and alpha |
+//!
+//! [`write_all`] adds `figures/` ([`figures`]) and `report.html` ([`page`]), and [`write_comparison`] puts
+//! several folders side by side.
 //!
 //! Nothing is simulated and nothing drawn except the bootstrap, whose streams are named: the same
 //! artefacts give the same bytes.
 
+pub mod archive;
 pub mod cross;
+pub mod figures;
 pub mod group;
+pub mod latex;
+pub mod page;
 pub mod render;
 pub mod runs;
 pub mod statistics;
 pub mod table;
 
+use figures::Figures;
+use group::groups;
+use latex::Latex;
 use render::{Csv, Json, Markdown, Render, Terminal};
 use runs::Runs;
 use std::io::Write as _;
 use std::path::{Path, PathBuf};
-use table::Table;
+use table::{Results, Table};
 
 /// Why no report could be made. Every message names the file and says what to do.
 #[derive(Debug, thiserror::Error)]
@@ -82,8 +92,8 @@ pub enum ReportError {
     },
 }
 
-/// Reads the runs below `dir`, writes `runs.csv`, `table.csv`, `table.md` and `cross.csv` into it and
-/// answers with the table as text for a terminal (at most 140 columns wide).
+/// Reads the runs below `dir`, writes `runs.csv`, `table.csv`, `table.md`, `table.tex` and `cross.csv`
+/// into it and answers with the table as text for a terminal (at most 140 columns wide).
 ///
 /// Each file is replaced in one step: a reader sees the old one or the new one, never a part.
 ///
@@ -92,26 +102,122 @@ pub enum ReportError {
 /// be written. Nothing is written unless everything could be read.
 pub fn write(dir: &Path) -> Result<String, ReportError> {
     let runs = Runs::read(dir)?;
-    let groups = group::groups(&runs);
-    let table = Table::new(&runs, &groups);
-    persist(&dir.join("runs.csv"), &runs.to_csv())?;
-    persist(&dir.join("table.csv"), &Csv.render(&table))?;
-    persist(&dir.join("table.md"), &Markdown.render(&table))?;
-    persist(&dir.join("cross.csv"), &cross::to_csv(&groups))?;
-    Ok(Terminal.render(&table))
+    write_tables(dir, &Results { name: "", runs: &runs, groups: groups(&runs) })
+        .map(|(_, terminal)| terminal)
+}
+
+/// What [`write_all`] has written.
+#[derive(Debug)]
+pub struct Written {
+    /// The table as text for a terminal.
+    pub table: String,
+    /// The figures, and those left out.
+    pub figures: Figures,
+}
+
+/// All that [`write()`] writes, the figures in `DIR/figures` as SVG and PNG, and `report.html`, a page
+/// with all of it and stored episodes that needs no other file.
+///
+/// # Errors
+/// As [`write()`].
+pub fn write_all(dir: &Path) -> Result<Written, ReportError> {
+    let runs = Runs::read(dir)?;
+    let name = names(&[dir]).remove(0);
+    let results = Results { name: &name, runs: &runs, groups: groups(&runs) };
+    let figures = figures::draw(&results.groups)?;
+    let (table, terminal) = write_tables(dir, &results)?;
+    let page = page::render(&name, &table, &results.groups, &figures)?;
+    persist_figures(dir, &figures)?;
+    persist(&dir.join("report.html"), page.as_bytes())?;
+    Ok(Written { table: terminal, figures })
+}
+
+fn write_tables(dir: &Path, results: &Results) -> Result<(Table, String), ReportError> {
+    persist(&dir.join("runs.csv"), results.runs.to_csv().as_bytes())?;
+    persist(&dir.join("cross.csv"), cross::to_csv(&results.groups).as_bytes())?;
+    let table = Table::new(std::slice::from_ref(results));
+    let terminal = write_table(&table, &dir.join("table"))?;
+    Ok((table, terminal))
+}
+
+/// Puts `dir` and `others` side by side, as `comparison.csv`, `comparison.md` and `comparison.tex` in
+/// `dir`, and answers with the table as text for a terminal. Differences are to `dir`.
+///
+/// # Errors
+/// As [`write()`], of any of the folders.
+pub fn write_comparison(dir: &Path, others: &[PathBuf]) -> Result<String, ReportError> {
+    with_comparison(dir, others, |table| write_table(table, &dir.join("comparison")))
 }
 
 /// The table for programs: one object with `schema`, `columns`, `worlds` and `notes`. Writes nothing.
 ///
 /// # Errors
 /// As [`write()`].
-pub fn table_json(dir: &Path) -> Result<serde_json::Value, ReportError> {
-    let runs = Runs::read(dir)?;
-    let groups = group::groups(&runs);
-    Ok(Json.value(&Table::new(&runs, &groups)))
+pub fn table_json(dir: &Path, others: &[PathBuf]) -> Result<serde_json::Value, ReportError> {
+    with_comparison(dir, others, |table| Ok(Json.value(table)))
 }
 
-fn persist(path: &Path, text: &str) -> Result<(), ReportError> {
+/// Draws the figures of the runs below `dir` into `DIR/figures`, each as SVG and PNG.
+///
+/// # Errors
+/// As [`write()`].
+pub fn write_figures(dir: &Path) -> Result<Figures, ReportError> {
+    let runs = Runs::read(dir)?;
+    let figures = figures::draw(&groups(&runs))?;
+    persist_figures(dir, &figures)?;
+    Ok(figures)
+}
+
+fn persist_figures(dir: &Path, figures: &Figures) -> Result<(), ReportError> {
+    let folder = dir.join("figures");
+    std::fs::create_dir_all(&folder)
+        .map_err(|source| ReportError::Write { path: folder.clone(), source })?;
+    for figure in &figures.drawn {
+        let stem = folder.join(&figure.name);
+        persist(&stem.with_extension("svg"), figure.svg.as_bytes())?;
+        let path = stem.with_extension("png");
+        let png = figures::png(&figure.svg).map_err(|what| ReportError::Write {
+            path: path.clone(),
+            source: std::io::Error::other(what),
+        })?;
+        persist(&path, &png)?;
+    }
+    Ok(())
+}
+
+fn with_comparison<T>(
+    dir: &Path,
+    others: &[PathBuf],
+    then: impl FnOnce(&Table) -> Result<T, ReportError>,
+) -> Result<T, ReportError> {
+    let dirs: Vec<&Path> =
+        std::iter::once(dir).chain(others.iter().map(PathBuf::as_path)).collect();
+    let runs: Vec<Runs> = dirs.iter().map(|dir| Runs::read(dir)).collect::<Result<_, _>>()?;
+    let names = names(&dirs);
+    let results: Vec<Results> = (runs.iter().zip(&names))
+        .map(|(runs, name)| Results { name, runs, groups: groups(runs) })
+        .collect();
+    then(&Table::new(&results))
+}
+
+/// Folders by their last part, or by the whole path where that is not enough.
+fn names(dirs: &[&Path]) -> Vec<String> {
+    let last = |dir: &Path| dir.file_name().map(|name| name.to_string_lossy().into_owned());
+    let unique =
+        |name: &String| dirs.iter().filter(|dir| last(dir).as_ref() == Some(name)).count() == 1;
+    dirs.iter()
+        .map(|dir| last(dir).filter(unique).unwrap_or_else(|| dir.display().to_string()))
+        .collect()
+}
+
+fn write_table(table: &Table, stem: &Path) -> Result<String, ReportError> {
+    persist(&stem.with_extension("csv"), Csv.render(table).as_bytes())?;
+    persist(&stem.with_extension("md"), Markdown.render(table).as_bytes())?;
+    persist(&stem.with_extension("tex"), Latex.render(table).as_bytes())?;
+    Ok(Terminal.render(table))
+}
+
+fn persist(path: &Path, bytes: &[u8]) -> Result<(), ReportError> {
     let attempt = || {
         let mut builder = tempfile::Builder::new();
         builder.prefix(".report-");
@@ -119,7 +225,7 @@ fn persist(path: &Path, text: &str) -> Result<(), ReportError> {
         #[cfg(unix)]
         builder.permissions(std::os::unix::fs::PermissionsExt::from_mode(0o666));
         let mut file = builder.tempfile_in(path.parent().unwrap_or(Path::new(".")))?;
-        file.write_all(text.as_bytes())?;
+        file.write_all(bytes)?;
         file.persist(path).map_err(|failed| failed.error)
     };
     attempt().map(|_| ()).map_err(|source| ReportError::Write { path: path.to_path_buf(), source })

@@ -14,6 +14,9 @@ use serde_json::{Value, json};
 /// Stands for a number that does not exist.
 const MISSING: &str = "–";
 
+/// Marks best values on a terminal.
+const BEST: &str = "*";
+
 /// Width of running text on a terminal.
 const TEXT_WIDTH: usize = 110;
 
@@ -28,33 +31,45 @@ pub trait Render {
     fn render(&self, table: &Table) -> String;
 }
 
-/// The two blocks that people see of a world.
-const BLOCKS: [(Block, &str); 2] = [
-    (Block::Returns, "greedy protagonist under nominal chance"),
-    (Block::Game, "against eta = 1, the game, certificates"),
-];
-
 /// The columns of a block that have a number in this world.
-fn columns(world: &World, block: Block) -> Vec<(usize, &'static Column)> {
-    let shown = |(place, column): &(usize, &Column)| column.block == block && world.has(*place);
+pub(super) fn columns(world: &World, block: Block) -> Vec<(usize, &'static Column)> {
+    let shown =
+        |(place, column): &(usize, &Column)| column.blocks.contains(&block) && world.has(*place);
     COLUMNS.iter().enumerate().filter(shown).collect()
 }
 
+/// Headings of what stands before the columns: which row it is.
+pub(super) fn row_headings(table: &Table) -> Vec<&'static str> {
+    if table.compares { vec!["eta", "folder", "seeds"] } else { vec!["eta", "seeds"] }
+}
+
+/// The cells below [`row_headings`], but for the seeds, which [`seeds`] tells.
+pub(super) fn row_name(table: &Table, row: &Row) -> Vec<String> {
+    let folder = table.compares.then(|| row.folder.clone());
+    std::iter::once(row.eta.to_string()).chain(folder).collect()
+}
+
 /// How the numbers came about, as terms and their meaning: columns shown, intervals, episodes, checks.
-pub fn legend(table: &Table) -> Vec<(String, String)> {
+/// `mark` is what best values look like.
+pub fn legend(table: &Table, mark: &str) -> Vec<(String, String)> {
     let mut legend = Vec::new();
     for (place, column) in COLUMNS.iter().enumerate() {
-        if column.block != Block::Data && table.worlds.iter().any(|world| world.has(place)) {
+        if !column.blocks.is_empty() && table.worlds.iter().any(|world| world.has(place)) {
             legend.push((column.title.to_owned(), column.meaning.to_owned()));
         }
     }
     let text = "[low, high] is a 95 % interval. Numbers are means over seeds, their intervals a nested \
                 bootstrap (seeds, then episodes; 2,000 replicates, percentiles). Rates: never \
-                narrower than Wilson's interval of all episodes. gain: Student t over the paired \
-                seeds. With one seed there is none.";
+                narrower than Wilson's interval of all episodes. gain and difference: Student t over the \
+                paired seeds. With one seed there is none.";
     legend.push(("intervals".to_owned(), text.to_owned()));
     let text = "does not exist for the row, or is a CVaR whose tail holds fewer than 10 episodes";
     legend.push((MISSING.to_owned(), text.to_owned()));
+    if table.worlds.iter().flat_map(|world| &world.rows).any(|row| row.best.contains(&true)) {
+        let text = "the best value of its column in the world, or one whose interval reaches into that \
+                    of the best; what is measured at level 1/eta is compared within an eta alone";
+        legend.push((mark.to_owned(), text.to_owned()));
+    }
     for world in &table.worlds {
         legend.push((world.name.clone(), format!("{}. {}", world.episodes, world.checks)));
     }
@@ -62,7 +77,7 @@ pub fn legend(table: &Table) -> Vec<(String, String)> {
 }
 
 /// A cell in words: its value and what stands below or behind it.
-fn words(format: Format, cell: Cell) -> (String, Option<String>) {
+pub(super) fn words(format: Format, cell: Cell) -> (String, Option<String>) {
     let (decimals, factor) = match format {
         Format::Count => (0, 1.0),
         Format::Estimate(decimals) | Format::Worst(decimals) => (decimals, 1.0),
@@ -93,7 +108,7 @@ fn fixed(value: f64, decimals: usize) -> String {
     }
 }
 
-fn seeds(row: &Row) -> (String, Option<String>) {
+pub(super) fn seeds(row: &Row) -> (String, Option<String>) {
     let failed = (row.failures > 0).then(|| format!("{} failed", row.failures));
     (row.seeds.to_string(), failed)
 }
@@ -105,7 +120,9 @@ impl Render for Terminal {
     fn render(&self, table: &Table) -> String {
         let mut text = String::new();
         for world in &table.worlds {
-            for (block, title) in BLOCKS {
+            // The others are for reading at leisure.
+            for block in [Block::Returns, Block::Game, Block::Comparison] {
+                let title = block.title();
                 let columns = columns(world, block);
                 if columns.is_empty() {
                     continue;
@@ -113,15 +130,16 @@ impl Render for Terminal {
                 let mut drawn = comfy_table::Table::new();
                 drawn.load_style(STYLE);
                 let titles = columns.iter().map(|(_, column)| column.title);
-                drawn.set_header(["eta", "seeds"].into_iter().chain(titles));
+                drawn.set_header(row_headings(table).into_iter().chain(titles));
                 for row in &world.rows {
-                    let cells = columns
-                        .iter()
-                        .map(|&(place, column)| words(column.format, row.cells[place]));
+                    let cells = columns.iter().map(|&(place, column)| {
+                        let (value, below) = words(column.format, row.cells[place]);
+                        (value + if row.best[place] { BEST } else { "" }, below)
+                    });
                     let cells = std::iter::once(seeds(row)).chain(cells).map(|(value, below)| {
                         below.map_or(value.clone(), |below| format!("{value}\n{below}"))
                     });
-                    drawn.add_row(std::iter::once(row.eta.to_string()).chain(cells));
+                    drawn.add_row(row_name(table, row).into_iter().chain(cells));
                 }
                 for column in drawn.column_iter_mut() {
                     column.set_cell_alignment(CellAlignment::Right);
@@ -129,7 +147,7 @@ impl Render for Terminal {
                 text += &format!("{}: {title}\n{}\n\n", world.name, drawn.trim_fmt());
             }
         }
-        let legend = legend(table);
+        let legend = legend(table, BEST);
         let width = legend.iter().map(|(term, _)| term.chars().count()).max().unwrap_or_default();
         for (term, meaning) in &legend {
             text += &wrapped(meaning, &format!("{term:<width$}  "), width + 2);
@@ -172,32 +190,34 @@ impl Render for Markdown {
         }
         for world in &table.worlds {
             text += &format!("\n## {}\n", world.name);
-            for (block, title) in BLOCKS {
+            for block in Block::ALL {
+                let title = block.title();
                 let columns = columns(world, block);
                 if columns.is_empty() {
                     continue;
                 }
-                let titles = columns.iter().map(|(_, column)| column.title.to_owned());
-                let mut lines: Vec<Vec<String>> =
-                    vec![["eta", "seeds"].map(str::to_owned).into_iter().chain(titles).collect()];
+                let titles = columns.iter().map(|(_, column)| column.title);
+                let mut lines: Vec<Vec<String>> = vec![
+                    row_headings(table).into_iter().chain(titles).map(str::to_owned).collect(),
+                ];
                 for row in &world.rows {
-                    let cells = columns
-                        .iter()
-                        .map(|&(place, column)| words(column.format, row.cells[place]));
+                    let cells = columns.iter().map(|&(place, column)| {
+                        let (value, behind) = words(column.format, row.cells[place]);
+                        let value = if row.best[place] { format!("**{value}**") } else { value };
+                        behind.map_or(value.clone(), |behind| format!("{value} {behind}"))
+                    });
                     let (count, failed) = seeds(row);
                     let count =
                         failed.map_or(count.clone(), |failed| format!("{count} ({failed})"));
-                    let cells = cells.map(|(value, behind)| {
-                        behind.map_or(value.clone(), |behind| format!("{value} {behind}"))
-                    });
-                    lines.push([row.eta.to_string(), count].into_iter().chain(cells).collect());
+                    let name = row_name(table, row).into_iter().map(|name| escaped(&name));
+                    lines.push(name.chain([count]).chain(cells).collect());
                 }
                 text +=
                     &format!("\n{}{}:\n\n{}", title[..1].to_uppercase(), &title[1..], grid(&lines));
             }
         }
         text += "\n## Legend\n\n";
-        for (term, meaning) in legend(table) {
+        for (term, meaning) in legend(table, "bold") {
             text += &format!("- **{term}**: {}\n", escaped(&meaning));
         }
         text
@@ -232,7 +252,7 @@ fn escaped(text: &str) -> String {
     line.replace('<', "&lt;").replace('*', "\\*").replace('`', "\\`")
 }
 
-/// CSV: `env,eta,alpha,seeds,failures`, then every column by its key; an estimate has `KEY`, `KEY_lo`
+/// CSV: `env,eta,alpha,seeds,failures` (behind `folder`, if there are several), then every column by its key; an estimate has `KEY`, `KEY_lo`
 /// and `KEY_hi`, the worst seed `KEY` and `KEY_seed`. Rates are fractions. Six decimals; empty where
 /// there is no number.
 pub struct Csv;
@@ -240,6 +260,9 @@ pub struct Csv;
 impl Render for Csv {
     fn render(&self, table: &Table) -> String {
         let mut header = ["env", "eta", "alpha", "seeds", "failures"].map(str::to_owned).to_vec();
+        if table.compares {
+            header.insert(0, "folder".to_owned());
+        }
         for Column { key, format, .. } in &COLUMNS {
             header.push((*key).to_owned());
             match format {
@@ -259,6 +282,9 @@ impl Render for Csv {
                     row.seeds.to_string(),
                     row.failures.to_string(),
                 ];
+                if table.compares {
+                    fields.insert(0, row.folder.clone());
+                }
                 for (column, &cell) in COLUMNS.iter().zip(&row.cells) {
                     let width = match column.format {
                         Format::Count => 1,
@@ -287,8 +313,8 @@ impl Render for Csv {
     }
 }
 
-/// JSON: `{schema, columns: {KEY: {title, meaning}}, worlds: [{env, episodes, checks, rows: [{eta, alpha,
-/// seeds, failures, KEY: ..}]}], notes}`. An estimate is `{value, low, high}`, the worst seed `{value,
+/// JSON: `{schema, columns: {KEY: {title, meaning}}, worlds: [{env, episodes, checks, rows: [{folder,
+/// eta, alpha, seeds, failures, KEY: ..}]}], notes}`. An estimate is `{value, low, high}`, the worst seed `{value,
 /// seed}`, a count a number; `null` where there is no number.
 pub struct Json;
 
@@ -308,6 +334,7 @@ impl Json {
         };
         let row = |row: &Row| {
             let mut value = json!({
+                "folder": row.folder,
                 "eta": row.eta,
                 "alpha": 1.0 / row.eta,
                 "seeds": row.seeds,

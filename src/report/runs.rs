@@ -3,8 +3,20 @@
 //! A run is a folder `DIR/ENV/eta-E/seed-N` ([`crate::experiment::artefacts`]). With an
 //! `evaluation.json` it is finished; without one it has failed if its `manifest.json` says so, and is
 //! in progress otherwise: skipped, and mentioned. A failed run stays a row, so that nobody loses it
-//! from sight. `manifest.json` may be missing beside an evaluation: results of other programs enter
-//! the table with `evaluation.json` alone.
+//! from sight.
+//!
+//! Results of other programs enter the same tables without a `manifest.json`: with an
+//! `evaluation.json`, or simply with an `episodes.csv`, which has a line per episode and these columns
+//! in any order:
+//!
+//! | column | meaning |
+//! |---|---|
+//! | `return` | the return J of the episode |
+//! | `steps` | its length |
+//! | `end` | `goal`, `lava` or `timeout` |
+//! | `protagonist` | `greedy` or `sampled`; may be left out: `greedy` |
+//! | `chance` | who decided the outcomes: `nominal`, `antagonist` (the learned one) or `exact` (the worst case); may be left out: `nominal` |
+//! | `clearance` | least distance to lava in the episode; may be left out |
 //!
 //! `runs.csv`, ordered by world, eta and seed; alpha = 1/eta; numbers with six decimals; an empty
 //! field is a number that does not exist (say, a certificate where the world has no yardstick) or a
@@ -34,8 +46,9 @@ use super::{ReportError, statistics};
 use crate::experiment::artefacts::{
     Chance, Evaluation, LARGEST_FILE, Manifest, Mode, Play, SCHEMA, read_at_most,
 };
-use crate::game::returns::ReturnLaw;
+use crate::game::returns::{Atom, ReturnLaw};
 use lava_envs::End;
+use serde::Deserialize;
 use serde::de::DeserializeOwned;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -57,6 +70,8 @@ pub struct Run {
     pub seconds: f64,
     /// What the evaluation found; a failed run may have none.
     pub evaluation: Option<Evaluation>,
+    /// Where all that lies.
+    pub folder: PathBuf,
 }
 
 impl Run {
@@ -280,8 +295,12 @@ fn folders(dir: &Path) -> Result<BTreeMap<String, PathBuf>, ReportError> {
 /// The run in a folder; `None` while it is in progress.
 fn read_run(folder: &Path, env: &str, eta: f64, seed: u64) -> Result<Option<Run>, ReportError> {
     let manifest: Option<Manifest> = read_json(&folder.join("manifest.json"))?;
-    let path = folder.join("evaluation.json");
-    let evaluation: Option<Evaluation> = read_json(&path)?;
+    let mut path = folder.join("evaluation.json");
+    let mut evaluation: Option<Evaluation> = read_json(&path)?;
+    if evaluation.is_none() {
+        path = folder.join("episodes.csv");
+        evaluation = read_episodes(&path, env, eta, seed)?;
+    }
     if let Some(evaluation) = &evaluation {
         check(evaluation, env, eta, seed)
             .map_err(|what| ReportError::Corrupt { path: path.clone(), what })?;
@@ -293,12 +312,13 @@ fn read_run(folder: &Path, env: &str, eta: f64, seed: u64) -> Result<Option<Run>
     let trained = (evaluation.as_ref().map(|of| (of.steps, of.seconds)))
         .or(manifest.map(|of| (of.steps, of.seconds)));
     let (steps, seconds) = trained.unwrap_or_default();
-    Ok(Some(Run { env: env.to_owned(), eta, seed, failure, steps, seconds, evaluation }))
+    let (env, folder) = (env.to_owned(), folder.to_owned());
+    Ok(Some(Run { env, eta, seed, failure, steps, seconds, evaluation, folder }))
 }
 
 /// Reads a file of ours; `None` if there is none. The version is looked at first: what another
 /// version wrote is not damaged.
-fn read_json<T: DeserializeOwned>(path: &Path) -> Result<Option<T>, ReportError> {
+pub(super) fn read_json<T: DeserializeOwned>(path: &Path) -> Result<Option<T>, ReportError> {
     let text = match read_at_most(path, LARGEST_FILE) {
         Ok(text) => text,
         Err(error) if error.kind() == std::io::ErrorKind::NotFound => return Ok(None),
@@ -313,6 +333,83 @@ fn read_json<T: DeserializeOwned>(path: &Path) -> Result<Option<T>, ReportError>
         return Err(ReportError::Schema { path: path.to_path_buf(), found, expected: SCHEMA });
     }
     serde_json::from_value(value).map(Some).map_err(|error| corrupt(error.to_string()))
+}
+
+/// A line of `episodes.csv`.
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Episode {
+    #[serde(rename = "return")]
+    value: f64,
+    steps: u32,
+    end: End,
+    #[serde(default = "greedy")]
+    protagonist: Mode,
+    #[serde(default = "nominal")]
+    chance: Chance,
+    clearance: Option<f64>,
+}
+
+fn greedy() -> Mode {
+    Mode::Greedy
+}
+
+fn nominal() -> Chance {
+    Chance::Nominal
+}
+
+/// The evaluation that the episodes of another program amount to; `None` if there is no such file.
+fn read_episodes(
+    path: &Path,
+    env: &str,
+    eta: f64,
+    seed: u64,
+) -> Result<Option<Evaluation>, ReportError> {
+    let file = match std::fs::File::open(path) {
+        Ok(file) => file,
+        Err(error) if error.kind() == std::io::ErrorKind::NotFound => return Ok(None),
+        Err(source) => return Err(ReportError::Read { path: path.to_path_buf(), source }),
+    };
+    let corrupt = |what: String| ReportError::Corrupt { path: path.to_path_buf(), what };
+    let mut episodes: Vec<Episode> = Vec::new();
+    for line in csv::Reader::from_reader(std::io::BufReader::new(file)).deserialize() {
+        episodes.push(line.map_err(|error| corrupt(error.to_string()))?);
+    }
+    if episodes.is_empty() {
+        return Err(corrupt("it has no episodes".to_owned()));
+    }
+    let mut plays = Vec::new();
+    for protagonist in [Mode::Greedy, Mode::Sampled] {
+        for chance in [Chance::Nominal, Chance::Antagonist, Chance::Exact] {
+            let of_kind = |of: &&Episode| of.protagonist == protagonist && of.chance == chance;
+            let own: Vec<&Episode> = episodes.iter().filter(of_kind).collect();
+            if own.is_empty() {
+                continue;
+            }
+            let clearances: Vec<f64> = own.iter().filter_map(|of| of.clearance).collect();
+            let law = ReturnLaw::recorded(own.iter().map(|of| Atom {
+                value: of.value,
+                undiscounted: of.value,
+                steps: of.steps,
+                end: of.end,
+                mass: 1.0,
+            }));
+            let mean_clearance =
+                statistics::mean(&clearances).filter(|_| clearances.len() == own.len());
+            plays.push(Play { protagonist, chance, law, mean_clearance });
+        }
+    }
+    Ok(Some(Evaluation {
+        schema: SCHEMA,
+        env: env.to_owned(),
+        eta,
+        seed,
+        steps: 0,
+        seconds: 0.0,
+        plays,
+        audit: None,
+        certificate: None,
+    }))
 }
 
 /// What the types of an evaluation do not promise.

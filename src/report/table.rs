@@ -2,10 +2,16 @@
 //!
 //! [`COLUMNS`] is the one description of the table: key, heading, what it means, how it is computed
 //! and formatted. Every output format ([`super::render`]) is rendered from it, the legend too.
+//!
+//! Several results folders, say of several methods or ablations, make one table with a row per world,
+//! eta and folder; the first folder is then what the others are compared with.
+//!
+//! Best values are marked by interval, not by digit: the best value of a column and all those whose
+//! interval reaches into its interval.
 
 use super::group::Group;
 use super::runs::{Run, Runs};
-use super::statistics::{self, Estimate};
+use super::statistics::{self, Estimate, Interval};
 use crate::experiment::artefacts::{Audit, Chance, Mode};
 use crate::game::returns::ReturnLaw;
 
@@ -16,15 +22,51 @@ const LEAK_ERRORS: f64 = 4.0;
 /// Fewer seeds than this get a warning about the intervals.
 const FEW_SEEDS: usize = 6;
 
-/// Where a column is shown.
+/// A table that people see of a world. A column shown in none is only where programs read.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Block {
-    /// The first block of a world: returns and ends of episodes.
+    /// Returns and ends of episodes.
     Returns,
-    /// The second block: comparison with eta = 1, the game, certificates.
+    /// Comparison with eta = 1, the game, certificates.
     Game,
-    /// Only where programs read.
-    Data,
+    /// Comparison with the first results folder.
+    Comparison,
+    /// The cross matrix: every policy at every level.
+    Cross,
+    /// Wall-clock time.
+    Cost,
+}
+
+impl Block {
+    /// All blocks, in order.
+    pub const ALL: [Block; 5] =
+        [Block::Returns, Block::Game, Block::Comparison, Block::Cross, Block::Cost];
+
+    /// What stands above it.
+    pub fn title(self) -> &'static str {
+        match self {
+            Block::Returns => "greedy protagonist under nominal chance",
+            Block::Game => "against eta = 1, the game, certificates",
+            Block::Comparison => "against the first results folder",
+            Block::Cross => "CVaR of the greedy protagonist at every level",
+            Block::Cost => "wall-clock time of training",
+        }
+    }
+}
+
+/// Which of a column's values is the best.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Best {
+    /// None: they are not to be compared.
+    None,
+    /// The highest.
+    Highest,
+    /// The lowest.
+    Lowest,
+    /// The highest of those of one eta: the value means something else at each.
+    HighestOfEta,
+    /// The lowest of those of one eta.
+    LowestOfEta,
 }
 
 /// Which kind of cell a column has, and how it is written.
@@ -67,29 +109,62 @@ pub struct Column {
     /// Heading for people.
     pub title: &'static str,
     /// Where it is shown.
-    pub block: Block,
+    pub blocks: &'static [Block],
     /// How it is written.
     pub format: Format,
+    /// Which value is marked.
+    pub best: Best,
     /// What it is, in one sentence of the legend.
     pub meaning: &'static str,
-    compute: fn(&Group, Option<&Group>) -> Cell,
+    compute: fn(&Group, &Others) -> Cell,
+}
+
+/// What a row is compared with.
+struct Others<'a> {
+    /// The row of the same folder at eta = 1.
+    neutral: Option<&'a Group<'a>>,
+    /// The row of the first folder at the same eta, if there are several folders.
+    first: Option<&'a Group<'a>>,
 }
 
 fn estimate(estimate: Option<Estimate>) -> Cell {
     estimate.map_or(Cell::Missing, Cell::Estimate)
 }
 
-/// What compares a row with the world's row at eta = 1.
+/// What compares a row with another one; that one itself is the baseline.
 fn against(
     group: &Group,
     baseline: Option<&Group>,
     compare: impl Fn(&Group) -> Option<Cell>,
 ) -> Cell {
     match baseline {
-        Some(_) if group.eta == 1.0 => Cell::Baseline,
+        Some(baseline) if std::ptr::eq(group, baseline) => Cell::Baseline,
         Some(baseline) => compare(baseline).unwrap_or(Cell::Missing),
         None => Cell::Missing,
     }
+}
+
+fn gain(group: &Group, baseline: Option<&Group>) -> Cell {
+    against(group, baseline, |baseline| {
+        group.difference(baseline).map(|(gain, _)| Cell::Estimate(gain))
+    })
+}
+
+fn pairs(group: &Group, baseline: Option<&Group>) -> Cell {
+    against(group, baseline, |baseline| {
+        group.difference(baseline).map(|(_, pairs)| Cell::Count(pairs as u64))
+    })
+}
+
+fn improvement(group: &Group, baseline: Option<&Group>) -> Cell {
+    against(group, baseline, |baseline| group.improvement(baseline).map(Cell::Estimate))
+}
+
+/// Mean over the runs of what their training took; runs of other programs do not say.
+fn cost(group: &Group, of: impl Fn(&Run) -> f64) -> Cell {
+    let values: Vec<f64> =
+        group.runs.iter().filter(|run| run.steps > 0 && run.seconds > 0.0).map(of).collect();
+    estimate(statistics::mean(&values).map(|value| Estimate { value, interval: None }))
 }
 
 /// CVaR at a fixed level; levels of [`super::group::ALPHAS`] are always measured.
@@ -105,68 +180,112 @@ fn violations(group: &Group) -> Option<u64> {
 }
 
 /// The columns, in order. World, eta, alpha, seeds and failures stand before them in every format.
-pub const COLUMNS: [Column; 21] = [
+pub static COLUMNS: [Column; 31] = [
     Column {
         key: "mean",
         title: "mean",
-        block: Block::Returns,
+        blocks: &[Block::Returns, Block::Cross],
         format: Format::Estimate(3),
+        best: Best::Highest,
         meaning: "mean return of the greedy protagonist under nominal chance",
         compute: |group, _| estimate(group.mean(|measures| measures.mean)),
     },
     Column {
         key: "cvar",
         title: "CVaR_1/eta",
-        block: Block::Returns,
+        blocks: &[Block::Returns],
         format: Format::Estimate(3),
+        best: Best::HighestOfEta,
         meaning: "mean of the worst 1/eta of its returns: what the row was trained for",
         compute: |group, _| cvar(group, group.alpha()),
     },
     Column {
+        key: "cvar_0.5",
+        title: "CVaR_0.5",
+        blocks: &[Block::Cross],
+        format: Format::Estimate(3),
+        best: Best::Highest,
+        meaning: "mean of its worst 50 % of returns",
+        compute: |group, _| cvar(group, 0.5),
+    },
+    Column {
+        key: "cvar_0.25",
+        title: "CVaR_0.25",
+        blocks: &[Block::Cross],
+        format: Format::Estimate(3),
+        best: Best::Highest,
+        meaning: "mean of its worst 25 % of returns",
+        compute: |group, _| cvar(group, 0.25),
+    },
+    Column {
+        key: "cvar_0.1",
+        title: "CVaR_0.1",
+        blocks: &[Block::Cross],
+        format: Format::Estimate(3),
+        best: Best::Highest,
+        meaning: "mean of its worst 10 % of returns",
+        compute: |group, _| cvar(group, 0.1),
+    },
+    Column {
+        key: "cvar_0.05",
+        title: "CVaR_0.05",
+        blocks: &[Block::Cross],
+        format: Format::Estimate(3),
+        best: Best::Highest,
+        meaning: "mean of its worst 5 % of returns",
+        compute: |group, _| cvar(group, 0.05),
+    },
+    Column {
         key: "cvar_0.04",
         title: "CVaR_0.04",
-        block: Block::Returns,
+        blocks: &[Block::Returns, Block::Cross],
         format: Format::Estimate(3),
+        best: Best::Highest,
         meaning: "mean of its worst 4 % of returns",
         compute: |group, _| cvar(group, 0.04),
     },
     Column {
         key: "cvar_0.01",
         title: "CVaR_0.01",
-        block: Block::Returns,
+        blocks: &[Block::Returns, Block::Cross],
         format: Format::Estimate(3),
+        best: Best::Highest,
         meaning: "mean of its worst 1 % of returns",
         compute: |group, _| cvar(group, 0.01),
     },
     Column {
         key: "lava",
         title: "lava %",
-        block: Block::Returns,
+        blocks: &[Block::Returns],
         format: Format::Percent,
+        best: Best::Lowest,
         meaning: "share of its episodes that end in lava",
         compute: |group, _| estimate(group.rate(|measures| measures.lava)),
     },
     Column {
         key: "goal",
         title: "goal %",
-        block: Block::Returns,
+        blocks: &[Block::Returns],
         format: Format::Percent,
+        best: Best::Highest,
         meaning: "share of its episodes that reach the goal; the rest runs into the time limit",
         compute: |group, _| estimate(group.rate(|measures| measures.goal)),
     },
     Column {
         key: "clearance",
         title: "clearance",
-        block: Block::Returns,
+        blocks: &[Block::Returns],
         format: Format::Estimate(3),
+        best: Best::None,
         meaning: "least distance to lava in an episode, on average (lava-grid: cells; lava-point: metres)",
         compute: |group, _| estimate(group.mean(|measures| measures.clearance)),
     },
     Column {
         key: "cvar_iqm",
         title: "IQM",
-        block: Block::Game,
+        blocks: &[Block::Game],
         format: Format::Estimate(3),
+        best: Best::HighestOfEta,
         meaning: "interquartile mean over seeds of CVaR_1/eta: the middle half of the runs",
         compute: |group, _| {
             // Of three seeds it is the mean once more.
@@ -180,8 +299,9 @@ pub const COLUMNS: [Column; 21] = [
     Column {
         key: "cvar_worst",
         title: "worst seed",
-        block: Block::Game,
+        blocks: &[Block::Game],
         format: Format::Worst(3),
+        best: Best::None,
         meaning: "CVaR_1/eta of the worst seed; a failed run is worse than any number",
         compute: |group, _| {
             let level = group.level(group.alpha());
@@ -192,59 +312,55 @@ pub const COLUMNS: [Column; 21] = [
     Column {
         key: "gain",
         title: "gain",
-        block: Block::Game,
+        blocks: &[Block::Game],
         format: Format::Estimate(3),
+        best: Best::None,
         meaning: "CVaR_1/eta minus CVaR at that same level of the eta = 1 policy of the same seed \
                   (positive: better than eta = 1)",
-        compute: |group, baseline| {
-            against(group, baseline, |baseline| {
-                group.difference(baseline).map(|(gain, _)| Cell::Estimate(gain))
-            })
-        },
+        compute: |group, others| gain(group, others.neutral),
     },
     Column {
         key: "gain_pairs",
         title: "pairs",
-        block: Block::Data,
+        blocks: &[],
         format: Format::Count,
+        best: Best::None,
         meaning: "number of seeds in gain",
-        compute: |group, baseline| {
-            against(group, baseline, |baseline| {
-                group.difference(baseline).map(|(_, pairs)| Cell::Count(pairs as u64))
-            })
-        },
+        compute: |group, others| pairs(group, others.neutral),
     },
     Column {
         key: "improvement",
         title: "P(better)",
-        block: Block::Game,
+        blocks: &[Block::Game],
         format: Format::Estimate(2),
+        best: Best::None,
         meaning: "probability that a run of the row beats a run of eta = 1 in CVaR at level 1/eta",
-        compute: |group, baseline| {
-            against(group, baseline, |baseline| group.improvement(baseline).map(Cell::Estimate))
-        },
+        compute: |group, others| improvement(group, others.neutral),
     },
     Column {
         key: "game_value",
         title: "game value",
-        block: Block::Game,
+        blocks: &[Block::Game],
         format: Format::Estimate(3),
+        best: Best::None,
         meaning: "mean return of the sampled protagonist under its learned antagonist (eta = 1: which can do nothing)",
         compute: |group, _| estimate(group.mean(|measures| measures.game_value)),
     },
     Column {
         key: "regret",
         title: "regret",
-        block: Block::Game,
+        blocks: &[Block::Game],
         format: Format::Estimate(4),
+        best: Best::LowestOfEta,
         meaning: "the best possible CVaR_1/eta minus that of the greedy protagonist",
         compute: |group, _| estimate(group.mean(|measures| measures.regret)),
     },
     Column {
         key: "antagonist_gap",
         title: "antagonist gap",
-        block: Block::Game,
+        blocks: &[Block::Game],
         format: Format::Estimate(4),
+        best: Best::None,
         meaning: "value of the greedy protagonist under its antagonist minus its CVaR_1/eta: \
                   how far the antagonist is from the worst case (0: perfect)",
         compute: |group, _| estimate(group.mean(|measures| measures.antagonist_gap)),
@@ -252,64 +368,128 @@ pub const COLUMNS: [Column; 21] = [
     Column {
         key: "timeout",
         title: "timeout %",
-        block: Block::Data,
+        blocks: &[],
         format: Format::Percent,
+        best: Best::None,
         meaning: "share of its episodes that run into the time limit",
         compute: |group, _| estimate(group.rate(|measures| measures.timeout)),
     },
     Column {
         key: "steps_to_goal",
         title: "steps to goal",
-        block: Block::Data,
+        blocks: &[],
         format: Format::Estimate(1),
+        best: Best::None,
         meaning: "mean length of its episodes that reach the goal",
         compute: |group, _| estimate(group.mean(|measures| measures.steps_to_goal)),
     },
     Column {
         key: "sampled_mean",
         title: "sampled mean",
-        block: Block::Data,
+        blocks: &[],
         format: Format::Estimate(3),
+        best: Best::None,
         meaning: "mean return of the sampled protagonist under nominal chance",
         compute: |group, _| estimate(group.mean(|measures| measures.sampled_mean)),
     },
     Column {
         key: "sampled_cvar",
         title: "sampled CVaR_1/eta",
-        block: Block::Data,
+        blocks: &[],
         format: Format::Estimate(3),
+        best: Best::None,
         meaning: "CVaR_1/eta of the sampled protagonist under nominal chance",
         compute: |group, _| estimate(group.mean(|measures| measures.sampled_cvar)),
     },
     Column {
         key: "bound_slack",
         title: "bound slack",
-        block: Block::Data,
+        blocks: &[],
         format: Format::Estimate(3),
+        best: Best::None,
         meaning: "game value minus CVaR_1/eta of the sampled protagonist: not below 0, else the budget leaks",
         compute: |group, _| estimate(group.mean(|measures| measures.bound_slack)),
     },
     Column {
         key: "budget_violations",
         title: "violations",
-        block: Block::Data,
+        blocks: &[],
         format: Format::Count,
+        best: Best::None,
         meaning: "steps or trajectories on which an antagonist overran its budget, over all seeds",
         compute: |group, _| violations(group).map_or(Cell::Missing, Cell::Count),
     },
+    Column {
+        key: "versus",
+        title: "difference",
+        blocks: &[Block::Comparison],
+        format: Format::Estimate(3),
+        best: Best::None,
+        meaning: "CVaR_1/eta minus that of the first results folder at the same eta and seed",
+        compute: |group, others| gain(group, others.first),
+    },
+    Column {
+        key: "versus_pairs",
+        title: "pairs",
+        blocks: &[Block::Comparison],
+        format: Format::Count,
+        best: Best::None,
+        meaning: "number of seeds in difference",
+        compute: |group, others| pairs(group, others.first),
+    },
+    Column {
+        key: "versus_improvement",
+        title: "P(better)",
+        blocks: &[Block::Comparison],
+        format: Format::Estimate(2),
+        best: Best::None,
+        meaning: "probability that a run of the row beats a run of the first folder in CVaR_1/eta",
+        compute: |group, others| improvement(group, others.first),
+    },
+    Column {
+        key: "steps",
+        title: "steps",
+        blocks: &[Block::Cost],
+        format: Format::Estimate(0),
+        best: Best::None,
+        meaning: "environment steps of training, mean over seeds",
+        compute: |group, _| cost(group, |run| run.steps as f64),
+    },
+    Column {
+        key: "seconds",
+        title: "seconds",
+        blocks: &[Block::Cost],
+        format: Format::Estimate(1),
+        best: Best::None,
+        meaning: "wall-clock seconds of training, mean over seeds",
+        compute: |group, _| cost(group, |run| run.seconds),
+    },
+    Column {
+        key: "steps_per_second",
+        title: "steps/s",
+        blocks: &[Block::Cost],
+        format: Format::Estimate(0),
+        best: Best::None,
+        meaning: "environment steps per wall-clock second of training, mean over seeds",
+        compute: |group, _| cost(group, |run| run.steps as f64 / run.seconds),
+    },
 ];
 
-/// One world and eta.
+/// One world and eta, in one results folder.
 #[derive(Debug, Clone)]
 pub struct Row {
     /// Budget eta.
     pub eta: f64,
+    /// Name of the results folder.
+    pub folder: String,
     /// Number of seeds, failed ones included.
     pub seeds: usize,
     /// Number of failed ones.
     pub failures: usize,
     /// One cell per entry of [`COLUMNS`].
     pub cells: Vec<Cell>,
+    /// Whether the cell is the best of its column, or not told apart from it.
+    pub best: Vec<bool>,
 }
 
 /// The rows of a world.
@@ -317,7 +497,7 @@ pub struct Row {
 pub struct World {
     /// Its name.
     pub name: String,
-    /// By eta.
+    /// By eta, then in the order of the folders.
     pub rows: Vec<Row>,
     /// How many episodes its numbers rest on.
     pub episodes: String,
@@ -333,9 +513,21 @@ impl World {
     }
 }
 
+/// The results of one folder.
+pub struct Results<'a> {
+    /// The folder's name.
+    pub name: &'a str,
+    /// Its runs.
+    pub runs: &'a Runs,
+    /// The same, measured.
+    pub groups: Vec<Group<'a>>,
+}
+
 /// All that is printed.
 #[derive(Debug, Clone)]
 pub struct Table {
+    /// Whether its rows are of several folders.
+    pub compares: bool,
     /// By name.
     pub worlds: Vec<World>,
     /// What a reader must know before trusting a number: failures, violations, runs left out.
@@ -343,29 +535,20 @@ pub struct Table {
 }
 
 impl Table {
-    /// Computes every cell. `groups` are those of `runs`.
-    pub fn new(runs: &Runs, groups: &[Group]) -> Table {
-        let worlds = groups
-            .chunk_by(|a, b| a.env == b.env)
-            .map(|groups| {
-                let baseline = groups.iter().find(|group| group.eta == 1.0);
-                let rows = groups.iter().map(|group| Row {
-                    eta: group.eta,
-                    seeds: group.runs.len(),
-                    failures: group.failures(),
-                    cells: COLUMNS.iter().map(|column| (column.compute)(group, baseline)).collect(),
-                });
-                World {
-                    name: groups[0].env.to_owned(),
-                    rows: rows.collect(),
-                    episodes: episodes(groups),
-                    checks: checks(groups),
-                }
-            })
-            .collect();
-        let mut notes: Vec<String> = runs.runs.iter().flat_map(warnings).collect();
-        notes.extend(runs.notes.iter().cloned());
-        let fewest = groups.iter().map(|group| group.runs.len()).min().unwrap_or_default();
+    /// Computes every cell. The first folder is what others are compared with.
+    pub fn new(results: &[Results]) -> Table {
+        let compares = results.len() > 1;
+        let groups = || results.iter().flat_map(|results| &results.groups);
+        let mut names: Vec<&str> = groups().map(|group| group.env).collect();
+        names.sort_unstable();
+        names.dedup();
+        let worlds = names.iter().map(|name| world(name, results)).collect();
+        let mut notes = Vec::new();
+        for Results { name, runs, .. } in results {
+            let own = runs.runs.iter().flat_map(warnings).chain(runs.notes.iter().cloned());
+            notes.extend(own.map(|note| if compares { format!("{name}: {note}") } else { note }));
+        }
+        let fewest = groups().map(|group| group.runs.len()).min().unwrap_or_default();
         if fewest == 1 {
             notes.push(
                 "Rows of one seed have no interval: nobody knows how seeds differ.".to_owned(),
@@ -377,7 +560,74 @@ impl Table {
                  interval, keeps its 95 %."
             ));
         }
-        Table { worlds, notes }
+        Table { compares, worlds, notes }
+    }
+}
+
+fn world(name: &str, results: &[Results]) -> World {
+    let mut rows = Vec::new();
+    let mut all: Vec<&Group> = Vec::new();
+    let find = |results: &'_ Results<'_>, eta: f64| {
+        results.groups.iter().position(|group| group.env == name && group.eta == eta)
+    };
+    for of in results {
+        for group in of.groups.iter().filter(|group| group.env == name) {
+            let first = results.first().filter(|_| results.len() > 1);
+            let others = Others {
+                neutral: find(of, 1.0).map(|place| &of.groups[place]),
+                first: first
+                    .and_then(|first| find(first, group.eta).map(|place| &first.groups[place])),
+            };
+            rows.push(Row {
+                eta: group.eta,
+                folder: of.name.to_owned(),
+                seeds: group.runs.len(),
+                failures: group.failures(),
+                cells: COLUMNS.iter().map(|column| (column.compute)(group, &others)).collect(),
+                best: vec![false; COLUMNS.len()],
+            });
+            all.push(group);
+        }
+    }
+    // Stable: within an eta the folders keep their order.
+    rows.sort_by(|a, b| a.eta.total_cmp(&b.eta));
+    mark(&mut rows);
+    World { name: name.to_owned(), rows, episodes: episodes(&all), checks: checks(&all) }
+}
+
+/// Marks the best value of each column and what cannot be told apart from it.
+fn mark(rows: &mut [Row]) {
+    for (place, column) in COLUMNS.iter().enumerate() {
+        match column.best {
+            Best::None => {}
+            Best::Highest => mark_among(rows, place, 1.0),
+            Best::Lowest => mark_among(rows, place, -1.0),
+            Best::HighestOfEta | Best::LowestOfEta => {
+                let sign = if column.best == Best::HighestOfEta { 1.0 } else { -1.0 };
+                for rows in rows.chunk_by_mut(|a, b| a.eta == b.eta) {
+                    mark_among(rows, place, sign);
+                }
+            }
+        }
+    }
+}
+
+fn mark_among(rows: &mut [Row], place: usize, sign: f64) {
+    // The interval, turned so that more is better, with the value in front.
+    let score = |row: &Row| match row.cells[place] {
+        Cell::Estimate(Estimate { value, interval: Some(Interval { low, high }) }) => {
+            let (worst, best) = if sign > 0.0 { (low, high) } else { (-high, -low) };
+            Some((sign * value, worst, best))
+        }
+        _ => None,
+    };
+    let scores: Vec<Option<(f64, f64, f64)>> = rows.iter().map(score).collect();
+    let known = || scores.iter().flatten();
+    let Some(best) = known().max_by(|a, b| a.0.total_cmp(&b.0)) else { return };
+    if known().count() > 1 {
+        for (row, score) in rows.iter_mut().zip(&scores) {
+            row.best[place] = score.is_some_and(|(_, _, reach)| reach >= best.1);
+        }
     }
 }
 
@@ -428,7 +678,7 @@ fn leaks(slack: f64, error: f64) -> bool {
 }
 
 /// The audits and the bound over all runs of a world, in words.
-fn checks(groups: &[Group]) -> String {
+fn checks(groups: &[&Group]) -> String {
     let runs = || groups.iter().flat_map(|group| group.runs);
     let mut checks = String::new();
     let audits: Vec<Audit> = runs().filter_map(|run| run.evaluation.as_ref()?.audit).collect();
@@ -456,7 +706,7 @@ fn checks(groups: &[Group]) -> String {
 }
 
 /// What the laws of a world's runs rest on, kind by kind.
-fn episodes(groups: &[Group]) -> String {
+fn episodes(groups: &[&Group]) -> String {
     let kinds = [
         ("greedy", Mode::Greedy, Chance::Nominal),
         ("sampled", Mode::Sampled, Chance::Nominal),

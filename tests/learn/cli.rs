@@ -188,6 +188,7 @@ mod runs {
         antagonist.minibatch = 200
         [evaluation]
         episodes = 200
+        exhibit_episodes = 200
         parallel_episodes = 100
         ";
 
@@ -223,9 +224,14 @@ mod runs {
         }
         let run = out.join("lava-grid/eta-25/seed-3");
         assert_eq!(json["folder"], run.to_str().unwrap());
-        for file in
-            ["config.toml", "manifest.json", "progress.csv", "final.safetensors", "evaluation.json"]
-        {
+        for file in [
+            "config.toml",
+            "manifest.json",
+            "progress.csv",
+            "final.safetensors",
+            "exhibits.json",
+            "evaluation.json",
+        ] {
             assert!(run.join(file).exists(), "{file} is missing");
         }
         let written = fs::metadata(run.join("final.safetensors")).unwrap().modified().unwrap();

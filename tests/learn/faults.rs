@@ -28,6 +28,7 @@ minibatch = 500
 every = 4
 [evaluation]
 episodes = 300
+exhibit_episodes = 300
 "#;
 
 const RUNS: [&str; 4] = [

@@ -15,7 +15,8 @@ fn pytorch_finds_the_greedy_actions_of_every_cell() {
     Command::cargo_bin("cvar-game")
         .unwrap()
         .args(["train", "--env", "lava-grid", "--eta", "25", "--seed", "1", "--steps", "100000"])
-        .args(["--set", "evaluation.episodes=100", "--out"])
+        .args(["--set", "evaluation.episodes=100", "--set", "evaluation.exhibit_episodes=100"])
+        .arg("--out")
         .arg(out.path())
         .assert()
         .success();

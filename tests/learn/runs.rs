@@ -30,6 +30,7 @@ seeds = [1, 2]
 steps = 30_000
 [evaluation]
 episodes = 500
+exhibit_episodes = 500
 "#;
 
 const RUNS: [&str; 8] = [
@@ -73,6 +74,8 @@ fn one_seed_gives_the_same_bits_whatever_the_jobs() {
         assert_eq!(without_timing(&progress[0]), without_timing(&progress[1]), "progress of {run}");
         let found = [&a, &b].map(|run| evaluation(&run.join("evaluation.json")));
         assert_eq!(found[0], found[1], "evaluation of {run}");
+        let shown = [&a, &b].map(|run| read(&run.join("exhibits.json")));
+        assert_eq!(shown[0], shown[1], "exhibits of {run}");
     }
     // Finished runs are skipped; nothing is trained again.
     let before =
@@ -89,7 +92,8 @@ fn exact_laws_agree_with(episodes: u64) {
     let folder = tempfile::tempdir().unwrap();
     program()
         .args(["train", "--env", "lava-grid", "--eta", "25", "--seed", "1", "--steps", "300000"])
-        .args(["--set", "evaluation.episodes=500", "--out"])
+        .args(["--set", "evaluation.episodes=500", "--set", "evaluation.exhibit_episodes=20000"])
+        .arg("--out")
         .arg(folder.path())
         .assert()
         .success();
@@ -150,7 +154,8 @@ fn rollouts_are_the_episodes_of_the_evaluation_step_by_step() {
     for env in ["lava-grid", "lava-point"] {
         program()
             .args(["train", "--env", env, "--eta", "25", "--seed", "1", "--steps", "40000"])
-            .args(["--set", "evaluation.episodes=300", "--out"])
+            .args(["--set", "evaluation.episodes=300", "--set", "evaluation.exhibit_episodes=300"])
+            .arg("--out")
             .arg(folder.path())
             .assert()
             .success();

@@ -141,6 +141,7 @@ steps = 600_000
 every = 5
 [evaluation]
 episodes = 500
+exhibit_episodes = 500
 "#;
 
 fn run(command: &mut Command) -> Output {

@@ -74,6 +74,7 @@ const RULES: &[(&str, Rule)] = &[
     ("train.bump.curvature", Number(Excluded(0.0), Included(1e6))),
     ("checkpoint.every", COUNT),
     ("evaluation.episodes", Whole(1, 100_000_000)),
+    ("evaluation.exhibit_episodes", Whole(1, 100_000_000)),
     ("evaluation.parallel_episodes", SIZE),
     ("evaluation.seed", Whole(0, i64::MAX)),
     ("evaluation.alphas", Number(Excluded(0.0), Included(1.0))),

@@ -101,7 +101,8 @@ pub fn protocol<W: Yardstick>(
     Ok(Findings { plays, audit, certificate })
 }
 
-fn play_episodes<W: Yardstick>(
+/// Plays the episodes of the run's evaluation, shown to `watcher`.
+pub(super) fn play_episodes<W: Yardstick>(
     run: &RunConfig,
     constants: &W::Constants,
     pair: &Pair<W>,
@@ -339,7 +340,7 @@ impl Yardstick for LavaGrid {
 }
 
 /// The sampled policy of a trained protagonist, by time where it is time-aware.
-fn policy_of(
+pub(super) fn policy_of(
     exact: &ExactGrid,
     constants: &GridConfig,
     pair: &Pair<LavaGrid>,

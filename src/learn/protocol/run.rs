@@ -3,7 +3,8 @@
 //! Training writes a checkpoint every so many updates, when it is asked to stop, and at its end. A run
 //! that was cut short goes on from the last one that is sound and ends with the same bits.
 
-use super::evaluation::{self, Yardstick};
+use super::evaluation;
+use super::exhibits::{Exhibited, RegretMeter, exhibits};
 use super::failure::RunError;
 use crate::train::{Game, Progress, Training};
 use crate::weights;
@@ -15,11 +16,15 @@ use cvar_game::experiment::config::{RunConfig, WorldConfig};
 use cvar_game::experiment::lock::RunLock;
 use cvar_game::experiment::runner::{Report, Tick, read_evaluation};
 use cvar_game::experiment::stop::Stop;
+use cvar_game::experiment::tensorboard::EventFile;
 use lava_envs::{LavaGrid, LavaPoint};
 use std::fs::{self, File, OpenOptions};
 use std::io::{self, Read, Seek, SeekFrom, Write};
 use std::path::Path;
-use std::time::Instant;
+use std::time::{Instant, SystemTime, UNIX_EPOCH};
+
+/// Points of the curve of the regret in training.
+const REGRET_POINTS: u64 = 40;
 
 /// Carries out the run and leaves its artefacts in `folder`, `evaluation.json` last. Goes on from what
 /// is there of the same run.
@@ -50,7 +55,7 @@ pub fn execute(
     }
 }
 
-fn carry_out<W: Yardstick>(
+fn carry_out<W: Exhibited>(
     run: &RunConfig,
     constants: &W::Constants,
     folder: &Path,
@@ -80,8 +85,16 @@ fn carry_out<W: Yardstick>(
     let about = format!("schema {SCHEMA}, run {}, steps {steps}", manifest.run);
     write_in_place(&path, &weights::to_bytes(&pair, about)?).map_err(RunError::file(&path))?;
 
-    let found = stop.interruptible(|| evaluation::protocol(run, constants, &pair));
-    let found = found.ok_or(RunError::Unfinished)??;
+    let found = stop.interruptible(|| {
+        Ok::<_, RunError>((
+            evaluation::protocol(run, constants, &pair)?,
+            exhibits(run, constants, &pair)?,
+        ))
+    });
+    let (found, shown) = found.ok_or(RunError::Unfinished)??;
+    let path = folder.join("exhibits.json");
+    let text = serde_json::to_vec(&shown).map_err(io::Error::other);
+    text.and_then(|text| write_in_place(&path, &text)).map_err(RunError::file(&path))?;
     let evaluation = Evaluation {
         schema: SCHEMA,
         env: run.env.name().to_string(),
@@ -98,17 +111,18 @@ fn carry_out<W: Yardstick>(
 }
 
 /// A run being trained.
-struct Attempt<'a, W: Yardstick> {
+struct Attempt<'a, W: Exhibited> {
     run: &'a RunConfig,
     folder: &'a Path,
     training: Training<'a, W>,
     progress: ProgressFile,
+    meter: Option<RegretMeter<W>>,
     /// Seconds of training before this attempt.
     before: f64,
     start: Instant,
 }
 
-impl<'a, W: Yardstick> Attempt<'a, W> {
+impl<'a, W: Exhibited> Attempt<'a, W> {
     /// From the last sound checkpoint or, without one, from scratch.
     fn begin(
         run: &'a RunConfig,
@@ -120,9 +134,10 @@ impl<'a, W: Yardstick> Attempt<'a, W> {
         let fresh = || -> Result<_, RunError> {
             Ok(Training::new(W::build(constants, run.train.parallel_episodes)?, game))
         };
+        let meter = W::regret_meter(constants, run)?;
         let start = Instant::now();
         // They tell how an earlier attempt ended.
-        for name in ["manifest.json", "final.safetensors"] {
+        for name in ["manifest.json", "final.safetensors", "exhibits.json"] {
             let path = folder.join(name);
             match fs::remove_file(&path) {
                 Err(error) if error.kind() != io::ErrorKind::NotFound => {
@@ -137,7 +152,7 @@ impl<'a, W: Yardstick> Attempt<'a, W> {
                 Ok((progress, before)) => {
                     let update = training.updates();
                     report(Report::Note(format!("goes on after update {update}")));
-                    return Ok(Attempt { run, folder, training, progress, before, start });
+                    return Ok(Attempt { run, folder, training, progress, meter, before, start });
                 }
                 Err(error) => {
                     let name = path.file_name().unwrap_or_default().to_string_lossy();
@@ -147,8 +162,8 @@ impl<'a, W: Yardstick> Attempt<'a, W> {
             }
         }
         let path = folder.join(ProgressFile::NAME);
-        let progress = ProgressFile::create(&path).map_err(RunError::file(&path))?;
-        Ok(Attempt { run, folder, training: fresh()?, progress, before: 0.0, start })
+        let progress = ProgressFile::create(folder).map_err(RunError::file(&path))?;
+        Ok(Attempt { run, folder, training: fresh()?, progress, meter, before: 0.0, start })
     }
 
     /// Environment steps so far.
@@ -166,8 +181,8 @@ impl<'a, W: Yardstick> Attempt<'a, W> {
         let mut saved = self.training.updates();
         while let Some(update) = self.training.update()? {
             let path = self.folder.join(ProgressFile::NAME);
-            let seconds = self.seconds();
-            self.progress.add(&update, seconds).map_err(RunError::file(&path))?;
+            let (seconds, regret) = (self.seconds(), self.regret()?);
+            self.progress.add(&update, seconds, regret).map_err(RunError::file(&path))?;
             report(Report::Tick(Tick { steps: update.steps, mean_return: update.mean_return }));
             let stopped = stop.signal().is_some();
             if stopped || update.update % every == 0 {
@@ -180,6 +195,15 @@ impl<'a, W: Yardstick> Attempt<'a, W> {
         }
         // The evaluation may be cut short as well.
         if saved < self.training.updates() { self.save() } else { Ok(()) }
+    }
+
+    /// The regret after the last update, if it is one at which it is measured.
+    fn regret(&self) -> Result<Option<f64>, RunError> {
+        let Some(meter) = &self.meter else { return Ok(None) };
+        let (steps, all) = (self.steps(), self.run.train.steps);
+        let points = |steps: u64| steps.min(all) * REGRET_POINTS / all;
+        let due = points(steps) > points(steps - self.run.train.rollout());
+        due.then(|| meter(&self.training.pair)).transpose()
     }
 
     fn save(&mut self) -> Result<(), RunError> {
@@ -198,7 +222,7 @@ impl<'a, W: Yardstick> Attempt<'a, W> {
 
 /// Brings training to where a checkpoint was written; the file of its progress, and the seconds that
 /// it took.
-fn resume<W: Yardstick>(
+fn resume<W: Exhibited>(
     path: &Path,
     run: &RunConfig,
     folder: &Path,
@@ -213,7 +237,7 @@ fn resume<W: Yardstick>(
         return Err(unfit("it is of another version of the program"));
     }
     training.restore(checkpoint.training).map_err(|error| unfit(&error.to_string()))?;
-    let progress = ProgressFile::resume(&folder.join(ProgressFile::NAME), checkpoint.progress)
+    let progress = ProgressFile::resume(folder, checkpoint.progress)
         .map_err(|error| CheckpointError::Unfit(format!("{}: {error}", ProgressFile::NAME)))?;
     Ok((progress, checkpoint.seconds))
 }
@@ -226,13 +250,18 @@ fn write_json(path: &Path, value: &impl serde::Serialize) -> Result<(), RunError
 }
 
 /// `progress.csv`: a line per update. `seconds` is the only column that differs between two runs of
-/// one seed.
-struct ProgressFile(csv::Writer<Counted>);
+/// one seed. The same goes to TensorBoard.
+struct ProgressFile {
+    csv: csv::Writer<Counted>,
+    events: EventFile,
+    /// When training would have begun had it never been cut short, in seconds since 1970.
+    begun: f64,
+}
 
 impl ProgressFile {
     const NAME: &'static str = "progress.csv";
 
-    const COLUMNS: [&'static str; 18] = [
+    const COLUMNS: [&'static str; 19] = [
         "update",
         "steps",
         "player",
@@ -249,19 +278,23 @@ impl ProgressFile {
         "gradient_norm",
         "explained_variance",
         "budget_use",
+        "regret",
         "steps_per_second",
         "seconds",
     ];
 
-    fn create(path: &Path) -> io::Result<Self> {
-        let mut writer = csv::Writer::from_writer(Counted::new(File::create(path)?));
-        writer.write_record(Self::COLUMNS)?;
-        Ok(ProgressFile(writer))
+    fn create(folder: &Path) -> io::Result<Self> {
+        let file = File::create(folder.join(Self::NAME))?;
+        let mut csv = csv::Writer::from_writer(Counted::new(file));
+        csv.write_record(Self::COLUMNS)?;
+        let begun = now();
+        Ok(ProgressFile { csv, events: EventFile::create(folder, begun)?, begun })
     }
 
     /// Goes on behind `extent`; what follows it is cut off.
-    fn resume(path: &Path, extent: Extent) -> io::Result<Self> {
-        let mut file = OpenOptions::new().read(true).write(true).open(path)?;
+    fn resume(folder: &Path, extent: Extent) -> io::Result<Self> {
+        let path = folder.join(Self::NAME);
+        let mut file = OpenOptions::new().read(true).write(true).open(&path)?;
         let mut counted = Counted::new(file.try_clone()?);
         let mut head = (&mut file).take(extent.bytes);
         io::copy(&mut head, &mut counted.seen)?;
@@ -270,18 +303,27 @@ impl ProgressFile {
         }
         file.set_len(extent.bytes)?;
         file.seek(SeekFrom::End(0))?;
-        Ok(ProgressFile(csv::Writer::from_writer(counted)))
+        // The events from their beginning: theirs is a format that nothing can be cut off.
+        let lines: Vec<csv::StringRecord> =
+            csv::Reader::from_path(&path)?.records().collect::<Result<_, _>>()?;
+        let seconds = lines.last().and_then(|line| line.iter().next_back()?.parse().ok());
+        let begun = now() - seconds.unwrap_or(0.0);
+        let mut events = EventFile::create(folder, begun)?;
+        for line in &lines {
+            add_event(&mut events, begun, line)?;
+        }
+        Ok(ProgressFile { csv: csv::Writer::from_writer(counted), events, begun })
     }
 
     /// What was written so far, which is on the disk then.
     fn extent(&mut self) -> io::Result<Extent> {
-        self.0.flush()?;
-        let counted = self.0.get_ref();
+        self.csv.flush()?;
+        let counted = self.csv.get_ref();
         counted.file.sync_data()?;
         Ok(counted.seen.extent())
     }
 
-    fn add(&mut self, of: &Progress, seconds: f64) -> io::Result<()> {
+    fn add(&mut self, of: &Progress, seconds: f64, regret: Option<f64>) -> io::Result<()> {
         let losses = &of.losses;
         let numbers = [
             of.budget,
@@ -300,9 +342,48 @@ impl ProgressFile {
         ];
         let head = [of.update.to_string(), of.steps.to_string(), of.role.to_string()];
         let timing = [format!("{:.0}", of.steps as f64 / seconds), format!("{seconds:.3}")];
-        let record = head.into_iter().chain(numbers.map(|x| format!("{x:.6}"))).chain(timing);
-        Ok(self.0.write_record(record)?)
+        let regret = regret.map_or(String::new(), |regret| format!("{regret:.6}"));
+        let numbers = numbers.map(|x| format!("{x:.6}")).into_iter().chain([regret]);
+        let line: csv::StringRecord = head.into_iter().chain(numbers).chain(timing).collect();
+        self.csv.write_record(&line)?;
+        add_event(&mut self.events, self.begun, &line)
     }
+}
+
+/// Columns of `progress.csv` by the names that users of CleanRL know.
+const TAGS: [(&str, &str); 15] = [
+    ("mean_return", "charts/episodic_return"),
+    ("goal", "charts/goal"),
+    ("lava", "charts/lava"),
+    ("regret", "charts/regret"),
+    ("budget", "charts/budget"),
+    ("budget_use", "charts/budget_use"),
+    ("learning_rate", "charts/learning_rate"),
+    ("steps_per_second", "charts/SPS"),
+    ("policy_loss", "losses/policy_loss"),
+    ("value_loss", "losses/value_loss"),
+    ("entropy", "losses/entropy"),
+    ("approx_kl", "losses/approx_kl"),
+    ("clip_fraction", "losses/clipfrac"),
+    ("gradient_norm", "losses/gradient_norm"),
+    ("explained_variance", "losses/explained_variance"),
+];
+
+/// A line of `progress.csv` as an event.
+fn add_event(events: &mut EventFile, begun: f64, line: &csv::StringRecord) -> io::Result<()> {
+    let field = |name: &str| {
+        let place = ProgressFile::COLUMNS.iter().position(|&column| column == name)?;
+        line.get(place)
+    };
+    let number = |name| field(name).and_then(|text| text.parse().ok()).unwrap_or(f64::NAN);
+    let player = field("player").unwrap_or_default();
+    let scalars = TAGS.map(|(name, tag)| (format!("{player}/{tag}"), number(name)));
+    events.add(begun + number("seconds"), number("steps") as u64, &scalars)
+}
+
+/// Seconds since 1970.
+fn now() -> f64 {
+    SystemTime::now().duration_since(UNIX_EPOCH).map_or(0.0, |time| time.as_secs_f64())
 }
 
 /// A file that knows its checksum. The writer above has a buffer.

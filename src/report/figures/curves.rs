@@ -1,0 +1,299 @@
+//! Curves and the cross matrix.
+
+use super::Panel;
+use super::canvas::{
+    Axes, INK, TEXT, chart, colour, figure, frame, heat, legend, on, scale, short, span, text,
+};
+use crate::exact::grid::ExactGrid;
+use crate::experiment::exhibits::WorldExhibit;
+use crate::report::archive::Update;
+use crate::report::group::ALPHAS;
+use lava_envs::GridConfig;
+use plotters::prelude::*;
+use plotters::style::text_anchor::{HPos, VPos};
+
+/// Points of a learning curve: a rollout by itself is too noisy to be read.
+const BINS: usize = 60;
+
+/// Budgets at which the curve of optima is evaluated, equally spaced in log eta.
+const OPTIMA: u32 = 60;
+
+/// Middle of a band and its ends.
+#[derive(Debug, Clone, Copy)]
+struct Band {
+    x: f64,
+    low: f64,
+    middle: f64,
+    high: f64,
+}
+
+/// Mean, least and greatest of what the seeds have at each x.
+fn over_seeds(seeds: &[Vec<(f64, f64)>]) -> Vec<Band> {
+    let longest = seeds.iter().map(Vec::len).max().unwrap_or_default();
+    (0..longest)
+        .filter_map(|place| {
+            let here: Vec<(f64, f64)> =
+                seeds.iter().filter_map(|seed| seed.get(place).copied()).collect();
+            let values = || here.iter().map(|(_, y)| *y).filter(|y| y.is_finite());
+            let count = values().count();
+            (count > 0).then(|| Band {
+                x: here[0].0,
+                low: values().fold(f64::INFINITY, f64::min),
+                middle: values().sum::<f64>() / count as f64,
+                high: values().fold(f64::NEG_INFINITY, f64::max),
+            })
+        })
+        .collect()
+}
+
+/// Bands in one chart, one for each eta.
+fn bands(
+    panels: &[Panel],
+    bands: &[Vec<Band>],
+    (x_title, y_title): (&'static str, &'static str),
+    dashed: &[Vec<(f64, f64)>],
+) -> Option<String> {
+    let all = || bands.iter().flatten();
+    let x = span(all().map(|band| band.x))?;
+    let y = span(all().flat_map(|band| [band.low, band.high]))?;
+    figure((1380, 760), |canvas| {
+        let (top, below) = canvas.split_vertically(46);
+        let words: Vec<_> = (panels.iter().enumerate().zip(bands))
+            .filter(|(_, band)| !band.is_empty())
+            .map(|((place, panel), _)| (format!("eta = {}", panel.group.eta), colour(place)))
+            .collect();
+        legend(&top, &words)?;
+        let mut chart = chart(&below, "", Axes { x, y, x_title, y_title })?;
+        for (place, band) in bands.iter().enumerate() {
+            let outline = band.iter().map(|band| (band.x, band.high));
+            let back = band.iter().rev().map(|band| (band.x, band.low));
+            let area: Vec<(f64, f64)> = outline.chain(back).collect();
+            chart.draw_series(std::iter::once(Polygon::new(area, colour(place).mix(0.18))))?;
+        }
+        for (place, band) in bands.iter().enumerate() {
+            let line = band.iter().map(|band| (band.x, band.middle));
+            chart.draw_series(LineSeries::new(line, colour(place).stroke_width(4)))?;
+        }
+        for (place, line) in dashed.iter().enumerate() {
+            let style = colour(place).stroke_width(4);
+            chart.draw_series(DashedLineSeries::new(line.iter().copied(), 10, 8, style))?;
+        }
+        Ok(())
+    })
+}
+
+pub(super) fn learning(panels: &[Panel]) -> Option<(String, String)> {
+    let of_panel = |panel: &Panel| {
+        let seeds: Vec<Vec<(f64, f64)>> = (panel.archives.iter())
+            .map(|(_, archive)| {
+                let updates = &archive.progress;
+                let width = updates.len().div_ceil(BINS).max(1);
+                let bin = |bin: &[Update]| {
+                    let returns: Vec<f64> =
+                        bin.iter().map(|of| of.mean_return).filter(|of| of.is_finite()).collect();
+                    let mean = returns.iter().sum::<f64>() / returns.len() as f64;
+                    (bin[bin.len() - 1].steps, mean)
+                };
+                updates.chunks(width).map(bin).collect()
+            })
+            .collect();
+        over_seeds(&seeds)
+    };
+    let found: Vec<Vec<Band>> = panels.iter().map(of_panel).collect();
+    let svg = bands(panels, &found, ("environment steps", "return in training"), &[])?;
+    let caption = "Mean undiscounted return of the episodes that ended in a rollout, the sampled protagonist \
+                   against its antagonist: so at eta above 1 it is not the nominal return, and it falls \
+                   as the budget rises. Line: mean over seeds; band: lowest and highest seed.";
+    Some((svg, caption.to_owned()))
+}
+
+pub(super) fn regret(panels: &[Panel]) -> Option<(String, String)> {
+    let of_panel = |panel: &Panel| {
+        let point = |update: &Update| Some((update.steps, update.regret?));
+        let seeds: Vec<Vec<(f64, f64)>> = (panel.archives.iter())
+            .map(|(_, archive)| archive.progress.iter().filter_map(point).collect())
+            .collect();
+        over_seeds(&seeds)
+    };
+    let found: Vec<Vec<Band>> = panels.iter().map(of_panel).collect();
+    let svg = bands(panels, &found, ("environment steps", "regret"), &[])?;
+    let caption = "V*(eta) minus the exact CVaR_1/eta of the greedy protagonist as it is after so many \
+                   steps (at eta = 1 the best mean minus its mean). Line: mean over seeds; band: lowest \
+                   and highest seed.";
+    Some((svg, caption.to_owned()))
+}
+
+pub(super) fn budget(panels: &[Panel]) -> Option<(String, String)> {
+    let mut found = Vec::new();
+    let mut exact = Vec::new();
+    for panel in panels {
+        let exhibits =
+            || panel.archives.iter().filter_map(|(_, archive)| archive.exhibits.as_ref());
+        let mean = |of: fn(&crate::experiment::exhibits::BudgetByTime) -> &Vec<f64>| {
+            let seeds: Vec<Vec<(f64, f64)>> = exhibits()
+                .filter_map(|exhibits| exhibits.budget.as_ref())
+                .map(|budget| (0..).map(f64::from).zip(of(budget).iter().copied()).collect())
+                .collect();
+            over_seeds(&seeds)
+        };
+        let (low, high) = (mean(|of| &of.low), mean(|of| &of.high));
+        found.push(
+            (mean(|of| &of.mean).iter().zip(low.iter().zip(&high)))
+                .map(|(band, (low, high))| Band { low: low.middle, high: high.middle, ..*band })
+                .collect(),
+        );
+        let seeds: Vec<Vec<(f64, f64)>> = exhibits()
+            .filter_map(|exhibits| match &exhibits.world {
+                WorldExhibit::LavaGrid(grid) => Some(&grid.exact_budget),
+                WorldExhibit::LavaPoint(_) => None,
+            })
+            .map(|budget| (0..).map(f64::from).zip(budget.iter().copied()).collect())
+            .collect();
+        exact.push(over_seeds(&seeds).iter().map(|band| (band.x, band.middle)).collect());
+    }
+    let svg = bands(panels, &found, ("time t (steps)", "log eta_t / log eta"), &exact)?;
+    let mut caption = "Remaining budget of the episodes that still run at time t, greedy protagonist against \
+                       its learned antagonist: 1 is all of it, 0 none. Line: mean over trajectories, then \
+                       seeds; band: 10 % and 90 % quantiles."
+        .to_owned();
+    if exact.iter().any(|line| !line.is_empty()) {
+        caption += " Dashed: the exact worst-case antagonist, in expectation.";
+    }
+    Some((svg, caption))
+}
+
+/// Mean and CVaR of the policies that are optimal at budgets from 1 to the greatest.
+fn optima(config: &GridConfig, gamma: f64, greatest: f64, alpha: f64) -> Vec<(f64, f64)> {
+    let Ok(exact) = ExactGrid::new(config, gamma) else { return Vec::new() };
+    let budget = |step: u32| greatest.powf(f64::from(step) / f64::from(OPTIMA));
+    let point = |step| {
+        let law = exact.optimum(budget(step)).ok()?.evaluation.law;
+        Some((law.cvar(alpha), law.mean()))
+    };
+    (0..=OPTIMA).filter_map(point).collect()
+}
+
+pub(super) fn frontier(
+    panels: &[Panel],
+    grid: Option<(&GridConfig, f64)>,
+) -> Option<(String, String)> {
+    let levels: Vec<f64> =
+        panels.iter().map(|panel| panel.group.alpha()).filter(|a| *a < 1.0).collect();
+    let greatest = panels.iter().map(|panel| panel.group.eta).fold(1.0, f64::max);
+    let curves: Vec<Vec<(f64, f64)>> = (levels.iter())
+        .map(|&alpha| {
+            grid.map_or(Vec::new(), |(config, gamma)| optima(config, gamma, greatest, alpha))
+        })
+        .collect();
+    let dots: Vec<Vec<(usize, f64, f64)>> = (levels.iter())
+        .map(|&alpha| {
+            let of_panel = |(place, panel): (usize, &Panel)| {
+                let level = panel.group.level(alpha);
+                let point = |measures: &crate::report::group::Measures| {
+                    Some((place, measures.cvar[level]?, measures.mean?))
+                };
+                panel.group.measures.iter().filter_map(point).collect::<Vec<_>>()
+            };
+            panels.iter().enumerate().flat_map(of_panel).collect()
+        })
+        .collect();
+    let points = || {
+        let dots = dots.iter().flatten().map(|&(_, x, y)| (x, y));
+        dots.chain(curves.iter().flatten().copied())
+    };
+    let (x, y) = (span(points().map(|(x, _)| x))?, span(points().map(|(_, y)| y))?);
+    let width = 690 * levels.len().max(1) as u32;
+    let svg = figure((width, 720), |canvas| {
+        let (top, below) = canvas.split_vertically(46);
+        let named = |(place, panel): (usize, &Panel)| {
+            (format!("trained at eta = {}", panel.group.eta), colour(place))
+        };
+        let mut words: Vec<_> = panels.iter().enumerate().map(named).collect();
+        if grid.is_some() {
+            words.push(("exact optima".to_owned(), INK));
+        }
+        legend(&top, &words)?;
+        for ((area, &alpha), (dots, curve)) in
+            below.split_evenly((1, levels.len())).iter().zip(&levels).zip(dots.iter().zip(&curves))
+        {
+            let title = format!("alpha = {}", short(alpha));
+            let axes = Axes { x: x.clone(), y: y.clone(), x_title: "CVaR_alpha", y_title: "mean" };
+            let mut chart = chart(area, &title, axes)?;
+            chart.draw_series(LineSeries::new(curve.iter().copied(), INK.stroke_width(3)))?;
+            chart.draw_series(curve.iter().map(|&point| Circle::new(point, 4, INK.filled())))?;
+            chart.draw_series(
+                dots.iter().map(|&(place, x, y)| {
+                    Circle::new((x, y), 10, colour(place).mix(0.75).filled())
+                }),
+            )?;
+        }
+        Ok(())
+    })?;
+    let mut caption = "A dot is the greedy protagonist of one seed under nominal chance: its mean return \
+                       against the mean of its worst alpha-share of returns. Up and right is better."
+        .to_owned();
+    if grid.is_some() {
+        caption += &format!(
+            " Black: the policies that are exactly optimal at budgets from 1 to {greatest}, each at \
+             both coordinates; no policy lies right of the curve's right end."
+        );
+    }
+    Some((svg, caption))
+}
+
+pub(super) fn cross(panels: &[Panel]) -> Option<(String, String)> {
+    let cell = |panel: &Panel, alpha| {
+        let level = panel.group.level(alpha);
+        panel.group.mean(|measures| measures.cvar[level]).map(|estimate| estimate.value)
+    };
+    let values: Vec<[Option<f64>; ALPHAS.len()]> =
+        panels.iter().map(|panel| ALPHAS.map(|alpha| cell(panel, alpha))).collect();
+    let known = || values.iter().flatten().flatten().copied();
+    let (low, high) =
+        (known().fold(f64::INFINITY, f64::min), known().fold(f64::NEG_INFINITY, f64::max));
+    if low > high {
+        return None;
+    }
+    let (left, width, height, top) = (190, 160, 92, 120);
+    let size = (left + width * ALPHAS.len() as i32 + 30, top + height * panels.len() as i32 + 90);
+    let svg = figure((size.0 as u32, size.1 as u32), |canvas| {
+        let centred = |colour| text(TEXT, colour, HPos::Center, VPos::Center);
+        canvas.draw(&Text::new(
+            "mean of the worst alpha-share of returns, alpha =",
+            (left, 36),
+            text(TEXT, INK, HPos::Left, VPos::Center),
+        ))?;
+        for (column, alpha) in ALPHAS.iter().enumerate() {
+            let x = left + width * column as i32 + width / 2;
+            canvas.draw(&Text::new(short(*alpha), (x, top - 30), centred(INK)))?;
+        }
+        for (row, (panel, values)) in panels.iter().zip(&values).enumerate() {
+            let y = top + height * row as i32;
+            canvas.draw(&Text::new(
+                format!("eta = {}", panel.group.eta),
+                (left - 18, y + height / 2),
+                text(TEXT, INK, HPos::Right, VPos::Center),
+            ))?;
+            for (column, value) in values.iter().enumerate() {
+                let Some(value) = value else { continue };
+                let x = left + width * column as i32;
+                let shade = heat((value - low) / (high - low).max(1e-9));
+                let area = [(x, y), (x + width, y + height)];
+                canvas.draw(&Rectangle::new(area, shade.filled()))?;
+                let middle = (x + width / 2, y + height / 2);
+                canvas.draw(&Text::new(format!("{value:.3}"), middle, centred(on(shade))))?;
+                // The level that the row was trained for.
+                if (ALPHAS[column] * panel.group.eta - 1.0).abs() < 1e-9 {
+                    let inner = [(x + 4, y + 4), (x + width - 4, y + height - 4)];
+                    canvas.draw(&frame(inner, on(shade).stroke_width(4)))?;
+                }
+            }
+        }
+        let strip = canvas.margin(size.1 - 70, 0, 0, 0);
+        scale(&strip, "CVaR_alpha", [short(low), short(high)])
+    })?;
+    let caption = "Rows are the budgets the policies were trained at, columns the levels they are measured \
+                   at: mean over seeds of the greedy protagonist's CVaR under nominal chance. Framed: the \
+                   level a row was trained for, which should hold the best value of its column.";
+    Some((svg, caption.to_owned()))
+}

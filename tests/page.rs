@@ -1,0 +1,286 @@
+//! Figures and page, from artefacts made up here; the page in a browser.
+
+use cvar_game::experiment::artefacts::{Chance, Evaluation, Mode, Play, SCHEMA};
+use cvar_game::experiment::config::Config;
+use cvar_game::experiment::exhibits::{
+    BudgetByTime, Deviations, Exhibits, GridExhibit, PointExhibit, ShiftMap, StoredEpisode,
+    WorldExhibit,
+};
+use cvar_game::experiment::plan;
+use cvar_game::game::returns::{Atom, ReturnLaw};
+use cvar_game::report;
+use lava_envs::End;
+use std::fs;
+use std::path::Path;
+use std::process::Command;
+
+/// Both worlds at eta 1 and 25, two seeds each, with everything a run leaves behind that is read here.
+fn results(dir: &Path) {
+    let settings = ["experiment.etas=[1,25]", "experiment.seeds=[1,2]"]
+        .map(|text| cvar_game::experiment::config::Setting::parse(text).unwrap());
+    let config = Config::resolve(None, &settings).unwrap();
+    for id in plan::runs(&config) {
+        let folder = id.folder(dir);
+        fs::create_dir_all(&folder).unwrap();
+        fs::write(folder.join("config.toml"), config.run(id).to_toml()).unwrap();
+        let progress = "steps,player,mean_return,regret\n10000,protagonist,-1.5,1.5\n20000,antagonist,0.25,0.25\n";
+        fs::write(folder.join("progress.csv"), progress).unwrap();
+        let law = || {
+            ReturnLaw::recorded((0..1000).map(|episode| Atom {
+                value: f64::from(episode % 100) / 100.0,
+                undiscounted: 0.0,
+                steps: 9,
+                end: if episode == 0 { End::Lava } else { End::Goal },
+                mass: 1.0,
+            }))
+        };
+        let play =
+            |protagonist, chance| Play { protagonist, chance, law: law(), mean_clearance: None };
+        let evaluation = Evaluation {
+            schema: SCHEMA,
+            env: id.env.to_string(),
+            eta: id.eta.get(),
+            seed: id.seed,
+            steps: 20_000,
+            seconds: 1.0,
+            plays: vec![play(Mode::Greedy, Chance::Nominal), play(Mode::Sampled, Chance::Nominal)],
+            audit: None,
+            certificate: None,
+        };
+        let text = serde_json::to_string(&evaluation).unwrap();
+        fs::write(folder.join("evaluation.json"), text).unwrap();
+        let text = serde_json::to_string(&exhibits(id.env.as_str(), id.eta.is_neutral())).unwrap();
+        fs::write(folder.join("exhibits.json"), text).unwrap();
+    }
+}
+
+fn exhibits(env: &str, neutral: bool) -> Exhibits {
+    let counts =
+        |share: f64| Deviations { visits: vec![1000.0; 70], deviations: vec![1000.0 * share; 70] };
+    let shifts = ShiftMap {
+        visits: vec![1000; 280],
+        shift: vec![[0.5, -0.5]; 280],
+        divergence: vec![0.1; 280],
+    };
+    let world = if env == "lava-grid" {
+        WorldExhibit::LavaGrid(GridExhibit {
+            occupancy: vec![0.5; 70],
+            learned: (!neutral).then(|| counts(0.375)),
+            exact: (!neutral).then(|| counts(0.625)),
+            exact_budget: if neutral { Vec::new() } else { vec![1.0, 0.5] },
+        })
+    } else {
+        WorldExhibit::LavaPoint(PointExhibit {
+            trajectories: vec![vec![[0.5, 0.5], [1.5, 3.0]]],
+            bins: if neutral { [0, 0] } else { [20, 14] },
+            shifts: if neutral { Vec::new() } else { vec![shifts; 3] },
+        })
+    };
+    let stored = |chance| StoredEpisode {
+        chance,
+        index: 0,
+        end: End::Lava,
+        value: -1.035,
+        path: vec![[0.0, 0.0], [1.0, 0.0], [2.0, 0.0]],
+        actions: vec![[0.0, 1.0]; 2],
+        outcomes: vec![[1.0, 0.0]; 2],
+        ratios: vec![2.0, 4.0],
+        budgets: vec![25.0, 12.5, 3.125],
+    };
+    let kinds =
+        if neutral { vec![Chance::Nominal] } else { vec![Chance::Nominal, Chance::Antagonist] };
+    Exhibits {
+        schema: SCHEMA,
+        episodes: 1000,
+        world,
+        budget: (!neutral).then(|| BudgetByTime {
+            running: vec![1000, 900],
+            mean: vec![1.0, 0.4],
+            low: vec![1.0, 0.1],
+            high: vec![1.0, 0.8],
+        }),
+        stored: kinds.into_iter().map(stored).collect(),
+    }
+}
+
+#[test]
+fn every_figure_is_drawn_as_svg_with_text_and_as_png() {
+    let dir = tempfile::tempdir().unwrap();
+    results(dir.path());
+    let written = report::write_all(dir.path()).unwrap();
+    assert_eq!(written.figures.missing, Vec::<String>::new());
+    let names: Vec<&str> =
+        written.figures.drawn.iter().map(|figure| figure.name.as_str()).collect();
+    assert_eq!(
+        names,
+        [
+            "lava-grid-map",
+            "lava-grid-occupancy",
+            "lava-grid-deviations",
+            "lava-grid-frontier",
+            "lava-grid-regret",
+            "lava-grid-cross",
+            "lava-grid-learning",
+            "lava-grid-budget",
+            "lava-point-trajectories",
+            "lava-point-shifts",
+            "lava-point-frontier",
+            "lava-point-cross",
+            "lava-point-learning",
+            "lava-point-budget",
+        ]
+    );
+    for figure in &written.figures.drawn {
+        let stem = dir.path().join("figures").join(&figure.name);
+        assert_eq!(fs::read_to_string(stem.with_extension("svg")).unwrap(), figure.svg);
+        assert!(figure.svg.contains("<text"), "{} has no text", figure.name);
+        let png = fs::read(stem.with_extension("png")).unwrap();
+        assert!(png.starts_with(b"\x89PNG"), "{} is no PNG", figure.name);
+    }
+    let figure = |name| written.figures.drawn.iter().find(|figure| figure.name == name).unwrap();
+    // The shares of both antagonists, which no axis can show by chance.
+    let deviations = &figure("lava-grid-deviations").svg;
+    assert!(deviations.contains(".38") && deviations.contains(".62"), "{deviations}");
+    assert!(figure("lava-grid-deviations").caption.contains("1000 trajectories"));
+}
+
+#[test]
+fn the_same_artefacts_give_the_same_page() {
+    let dir = tempfile::tempdir().unwrap();
+    results(dir.path());
+    let page = || {
+        report::write_all(dir.path()).unwrap();
+        fs::read_to_string(dir.path().join("report.html")).unwrap()
+    };
+    let text = page();
+    assert_eq!(text, page());
+    // Nothing is fetched: the only address is the name of SVG's language.
+    assert_eq!(text.matches("http").count(), text.matches("http://www.w3.org/2000/svg").count());
+    assert!(!text.contains("src=") && !text.contains("@import"));
+}
+
+/// Those of former versions and of other programs.
+#[test]
+fn runs_without_exhibits_report_all_the_same() {
+    let dir = tempfile::tempdir().unwrap();
+    results(dir.path());
+    for entry in ["lava-grid", "lava-point"] {
+        for (eta, seed) in [(1, 1), (1, 2), (25, 1), (25, 2)] {
+            let folder = dir.path().join(format!("{entry}/eta-{eta}/seed-{seed}"));
+            fs::remove_file(folder.join("exhibits.json")).unwrap();
+            if entry == "lava-point" {
+                fs::remove_file(folder.join("config.toml")).unwrap();
+                fs::remove_file(folder.join("progress.csv")).unwrap();
+            }
+        }
+    }
+    let written = report::write_all(dir.path()).unwrap();
+    let drawn: Vec<&str> =
+        written.figures.drawn.iter().map(|figure| figure.name.as_str()).collect();
+    assert_eq!(
+        drawn,
+        [
+            "lava-grid-map",
+            "lava-grid-frontier",
+            "lava-grid-regret",
+            "lava-grid-cross",
+            "lava-grid-learning",
+            "lava-point-frontier",
+            "lava-point-cross",
+        ]
+    );
+    assert!(written.figures.missing.contains(&"lava-grid: where chance is bent".to_owned()));
+    let page = fs::read_to_string(dir.path().join("report.html")).unwrap();
+    assert!(page.contains("No episodes were stored.") && page.contains("Left out"), "{page}");
+}
+
+#[test]
+fn damaged_exhibits_are_named() {
+    for (spoil, said) in
+        [("divergence", "maps are of unequal size"), ("ratios", "episode lacks a part")]
+    {
+        let dir = tempfile::tempdir().unwrap();
+        results(dir.path());
+        let path = dir.path().join("lava-point/eta-25/seed-2/exhibits.json");
+        let mut value: serde_json::Value =
+            serde_json::from_slice(&fs::read(&path).unwrap()).unwrap();
+        let list = match spoil {
+            "divergence" => &mut value["world"]["lava-point"]["shifts"][1][spoil],
+            _ => &mut value["stored"][0][spoil],
+        };
+        list.as_array_mut().unwrap().pop();
+        fs::write(&path, value.to_string()).unwrap();
+        let error = report::write_all(dir.path()).unwrap_err().to_string();
+        assert!(error.contains("seed-2/exhibits.json") && error.contains(said), "{error}");
+        assert!(!dir.path().join("report.html").exists());
+    }
+}
+
+/// In headless Chromium, at a desk's and a phone's width: no error, tables sort, the player advances
+/// and is worked by keyboard.
+#[test]
+#[ignore = "needs chromium"]
+fn the_page_works_in_a_browser() {
+    let dir = tempfile::tempdir().unwrap();
+    results(dir.path());
+    report::write_all(dir.path()).unwrap();
+    let page = fs::read_to_string(dir.path().join("report.html")).unwrap();
+    let first = "<script>window.errors = []; window.onerror = (text) => errors.push(text); \
+                 console.error = (...all) => errors.push(all.join(' '));</script>";
+    let last = r#"<script>
+        const of = (id) => document.getElementById(id);
+        const rows = () => [...document.querySelector("tbody").rows].map((row) => row.cells[0].textContent).join();
+        const result = { before: rows() };
+        document.querySelector("th button").click();
+        document.querySelector("th button").click();
+        result.sorted = rows();
+        of("env").value = "lava-point";
+        of("env").dispatchEvent(new Event("change"));
+        of("eta").value = "25";
+        of("eta").dispatchEvent(new Event("change"));
+        of("chance").value = "antagonist";
+        of("chance").dispatchEvent(new Event("change"));
+        result.start = of("told").textContent;
+        of("play").click();
+        setTimeout(() => {
+          result.end = of("told").textContent;
+          of("scrub").value = 1;
+          of("scrub").dispatchEvent(new Event("input"));
+          result.scrubbed = of("told").textContent;
+          result.wide = document.documentElement.scrollWidth - document.documentElement.clientWidth;
+          result.errors = errors;
+          document.title = JSON.stringify(result);
+        }, 1500);
+        </script></body>"#;
+    let path = dir.path().join("driven.html");
+    let driven = page.replacen("<head>", &format!("<head>{first}"), 1);
+    fs::write(&path, driven.replacen("</body>", last, 1)).unwrap();
+    for width in [1280, 390] {
+        let output = Command::new("chromium")
+            .args(["--headless", "--no-sandbox", "--disable-gpu", "--dump-dom"])
+            .arg(format!("--window-size={width},900"))
+            .arg("--virtual-time-budget=5000")
+            .arg(format!("--user-data-dir={}", dir.path().join("profile").display()))
+            .arg(format!("file://{}", path.display()))
+            .output()
+            .unwrap();
+        let text = String::from_utf8_lossy(&output.stdout);
+        let title = text.split("<title>").nth(1).and_then(|rest| rest.split("</title>").next());
+        let result: serde_json::Value = serde_json::from_str(title.unwrap()).unwrap();
+        assert_eq!(result["errors"], serde_json::json!([]), "{result}");
+        assert_eq!(
+            (result["before"].as_str(), result["sorted"].as_str()),
+            (Some("1,25"), Some("25,1"))
+        );
+        let said = |key: &str, what: &str| {
+            assert!(result[key].as_str().unwrap().contains(what), "{key}: {result}");
+        };
+        said("start", "step 0 of 2 · remaining budget 25");
+        said("end", "product so far 8.00 · ended: lava, return -1.035");
+        said(
+            "scrubbed",
+            "step 1 of 2 · remaining budget 12.5 · likelihood ratio of the last outcome 2.00",
+        );
+        assert_eq!(result["wide"], 0, "the page is wider than {width} pixels");
+    }
+}
