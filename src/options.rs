@@ -26,6 +26,9 @@ pub struct TrainOptions {
     pub budget_wait: f64,
     /// Share of the run over which the budget then rises from 1 to eta, linearly in log eta.
     pub budget_rise: f64,
+    /// Share of the run at its end in which the antagonist alone is updated, against the greedy
+    /// protagonist: a best response to the final policy.
+    pub response: f64,
     /// Hides the remaining budget from the antagonist (an ablation).
     pub hide_budget: bool,
     /// The protagonist.

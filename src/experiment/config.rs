@@ -535,10 +535,11 @@ fn check_together(train: &TrainOptions, world: WorldName) -> Result<(), ConfigEr
             ));
         }
     }
-    let ramp = train.budget_wait + train.budget_rise;
-    if ramp > 1.0 {
+    let phases = train.budget_wait + train.budget_rise + train.response;
+    if phases > 1.0 {
         return conflict(format!(
-            "train.budget_wait + train.budget_rise = {ramp} must be at most 1, the whole run"
+            "train.budget_wait + train.budget_rise + train.response = {phases} must be at most 1, the \
+             whole run"
         ));
     }
     if train.credit == Credit::Executed && world != WorldName::LavaGrid {

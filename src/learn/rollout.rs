@@ -8,7 +8,7 @@ use crate::pair::Pair;
 use crate::trajectories::Trajectories;
 use cvar_game::game::budget::{Budget, Eta};
 use cvar_game::game::returns::Atom;
-use cvar_game::options::Credit;
+use cvar_game::options::{Credit, TrainOptions};
 use lava_envs::random::{Purpose, position, stream, stream_from};
 use lava_envs::{End, Law};
 
@@ -55,9 +55,15 @@ impl<W: Arena> Collector<W> {
         }
     }
 
-    /// Plays `steps` steps in every slot; episodes that end are followed by new ones. New episodes
-    /// start with budget `eta`; a game at budget 1 is played without the antagonist.
-    pub fn collect(&mut self, pair: &Pair<W>, eta: Eta, steps: usize, credit: Credit) {
+    /// Plays the steps of a rollout in every slot; episodes that end are followed by new ones. New
+    /// episodes start with budget `eta`; a game at budget 1 is played without the antagonist.
+    pub fn collect(
+        &mut self,
+        pair: &Pair<W>,
+        eta: Eta,
+        choosing: Choosing,
+        options: &TrainOptions,
+    ) {
         self.protagonist.clear();
         self.antagonist.clear();
         self.finished.clear();
@@ -68,9 +74,9 @@ impl<W: Arena> Collector<W> {
                 self.begin(slot, eta);
             }
         }
-        for _ in 0..steps {
-            self.contest.step(pair, Choosing::Sampled, &chance);
-            self.record_protagonist(pair, credit);
+        for _ in 0..options.rollout_steps {
+            self.contest.step(pair, choosing, &chance);
+            self.record_protagonist(pair, options.credit);
             if !eta.is_neutral() {
                 self.record_antagonist();
             }
@@ -80,7 +86,7 @@ impl<W: Arena> Collector<W> {
         }
         // The states after the last step. The antagonist's state holds an action: one is drawn for
         // this purpose alone, which leaves its value unbiased.
-        self.contest.choose(&pair.protagonist, &pair.views, Choosing::Sampled);
+        self.contest.choose(&pair.protagonist, &pair.views, choosing);
         self.protagonist.inputs.extend_from_slice(&self.contest.protagonist_inputs);
         if !eta.is_neutral() {
             self.contest.show_antagonist(&pair.views);

@@ -2,6 +2,7 @@
 
 use crate::arena::Arena;
 use crate::checkpoint::{TrainingState, Unfit};
+use crate::contest::Choosing;
 use crate::pair::Pair;
 use crate::ppo::{Losses, Player, Rates};
 use crate::rollout::Collector;
@@ -122,7 +123,7 @@ impl<'a, W: Arena> Training<'a, W> {
         let Some(&turn) = self.turns.get(self.done) else { return Ok(None) };
         let Game { gamma, options, .. } = *self.game;
         let Training { pair, collector, minibatches, .. } = self;
-        collector.collect(pair, turn.budget, options.rollout_steps, options.credit);
+        collector.collect(pair, turn.budget, turn.choosing, options);
         let rates = turn.rates;
         let losses = match (turn.role, &mut pair.antagonist) {
             (Role::Antagonist, Some(antagonist)) => antagonist.update(
@@ -208,21 +209,28 @@ pub struct Turn {
     pub role: Role,
     /// Budget of the rollout.
     pub budget: Eta,
+    /// How the protagonist picks its actions in the rollout.
+    pub choosing: Choosing,
     /// Rates of the update.
     pub rates: Rates,
 }
 
 /// All turns of a run: K of the follower, one of the leader, and so on. While the budget is 1 every
-/// turn is the protagonist's. Each player's rates fall linearly over its own turns.
+/// turn is the protagonist's; at the end those of the response to its greedy policy are the
+/// antagonist's. Each player's rates fall linearly over its own turns.
 pub fn schedule(options: &TrainOptions, eta: Eta) -> Vec<Turn> {
     let updates = options.steps.div_ceil(options.rollout());
     let round = u64::from(options.follower_updates) + 1;
+    let responds = |update: u64| (updates - update) as f64 <= options.response * updates as f64;
     let mut played = 0; // turns at a budget above 1
     let roles: Vec<(Role, Eta)> = (0..updates)
         .map(|update| {
             let budget = budget_at(options, eta, update as f64 / updates as f64);
             if budget.is_neutral() {
                 return (Role::Protagonist, budget);
+            }
+            if responds(update) {
+                return (Role::Antagonist, budget);
             }
             played += 1;
             let leads = played % round == 0;
@@ -244,7 +252,9 @@ pub fn schedule(options: &TrainOptions, eta: Eta) -> Vec<Turn> {
             learning_rate: between(player.learning_rate, player.learning_rate_final),
             entropy: between(player.entropy, player.entropy_final),
         };
-        Turn { update: update as u64 + 1, role, budget, rates }
+        let response = !budget.is_neutral() && responds(update as u64);
+        let choosing = if response { Choosing::Greedy } else { Choosing::Sampled };
+        Turn { update: update as u64 + 1, role, budget, choosing, rates }
     };
     roles.iter().enumerate().map(turn).collect()
 }

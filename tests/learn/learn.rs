@@ -52,6 +52,7 @@ fn options() -> TrainOptions {
         credit: Credit::Chosen,
         budget_wait: 0.0,
         budget_rise: 0.0,
+        response: 0.0,
         hide_budget: false,
         protagonist: player(),
         initial_std: 1.0,

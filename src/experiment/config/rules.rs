@@ -55,6 +55,7 @@ const RULES: &[(&str, Rule)] = &[
     ("train.credit", Word(&["chosen", "executed"])),
     ("train.budget_wait", Number(Included(0.0), Excluded(1.0))),
     ("train.budget_rise", SHARE),
+    ("train.response", SHARE),
     ("train.hide_budget", Flag),
     ("train.initial_std", POSITIVE),
     ("train.PLAYER.hidden", Whole(1, 65_536)),

@@ -18,6 +18,7 @@ use cvar_game::experiment::names::WorldName;
 use cvar_game::game::budget::{Budget, Eta};
 use cvar_game::game::perturbation::{Family, Perturbation};
 use cvar_game::options::TrainOptions;
+use cvar_learn::contest::Choosing;
 use cvar_learn::arena::Arena;
 use cvar_learn::pair::Pair;
 use cvar_learn::ppo::Rates;
@@ -146,7 +147,7 @@ fn update<W: Bench>(criterion: &mut Criterion) {
     let mut group = criterion.benchmark_group("update");
     group.throughput(Throughput::Elements(options.rollout()));
     let (mut pair, mut collector) = opening::<W>(&options);
-    collector.collect(&pair, eta(), options.rollout_steps, options.credit);
+    collector.collect(&pair, eta(), Choosing::Sampled, &options);
     let rates = |entropy: f64| Rates { learning_rate: 0.0, entropy };
     let random: &mut ChaCha8Rng = &mut stream(SEED, Purpose::Minibatches, 0);
 
