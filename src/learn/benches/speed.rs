@@ -18,8 +18,8 @@ use cvar_game::experiment::names::WorldName;
 use cvar_game::game::budget::{Budget, Eta};
 use cvar_game::game::perturbation::{Family, Perturbation};
 use cvar_game::options::TrainOptions;
-use cvar_learn::contest::Choosing;
 use cvar_learn::arena::Arena;
+use cvar_learn::contest::Choosing;
 use cvar_learn::pair::Pair;
 use cvar_learn::ppo::Rates;
 use cvar_learn::rollout::Collector;
@@ -131,7 +131,7 @@ fn rollout<W: Bench>(criterion: &mut Criterion) {
     group.throughput(Throughput::Elements(options.rollout()));
     let (pair, mut collector) = opening::<W>(&options);
     group.bench_function(W::NAME.to_string(), |bencher| {
-        bencher.iter(|| collector.collect(&pair, eta(), options.rollout_steps, options.credit));
+        bencher.iter(|| collector.collect(&pair, eta(), Choosing::Sampled, &options));
     });
     group.finish();
 }
