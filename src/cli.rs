@@ -282,13 +282,15 @@ pub enum Antagonist {
 ///
 /// lava-grid is solved exactly. On lava-point a near-optimal controller is computed on a lattice and
 /// played in the physical world, which takes minutes; what it attains there is a lower bound on the
-/// best CVaR. The certificate is kept in $XDG_CACHE_HOME/cvar-game/oracle, by default under ~/.cache.
+/// best CVaR. The certificates of the default world at eta 1, 25 and 100 come with the program; others
+/// are kept in $XDG_CACHE_HOME/cvar-game/oracle, by default under ~/.cache.
 #[derive(Debug, Args)]
 #[command(after_help = "\
 Examples:
   cvar-game exact --env lava-grid --eta 25
   cvar-game exact --env lava-grid --eta 100 --set env.slip=0.1 --json
-  cvar-game exact --env lava-point --eta 25")]
+  cvar-game exact --env lava-point --eta 25
+  cvar-game exact --env lava-point --eta 25 --cell 0.2 --velocity 0.75")]
 pub struct ExactArgs {
     /// World: lava-grid or lava-point.
     #[arg(long)]
@@ -299,6 +301,15 @@ pub struct ExactArgs {
     /// Configuration file.
     #[arg(long, value_name = "FILE")]
     pub config: Option<PathBuf>,
+    /// lava-point: distance of the lattice's positions, in m [default: 0.1].
+    #[arg(long, value_name = "M")]
+    pub cell: Option<f64>,
+    /// lava-point: distance of the lattice's velocities, in m/s [default: 0.5].
+    #[arg(long, value_name = "M/S")]
+    pub velocity: Option<f64>,
+    /// lava-point: compute, though a certificate is known.
+    #[arg(long)]
+    pub anew: bool,
     /// Answer as JSON.
     #[arg(long)]
     pub json: bool,
@@ -504,10 +515,15 @@ fn exact(args: &ExactArgs) -> Result<ExitCode> {
             answer::give(&exact::grid::solve(grid, gamma, eta)?, args.json)
         }
         WorldConfig::LavaPoint(point) => {
-            let effort = oracle::Effort::default();
-            let certified = match oracle::cache_folder() {
-                Some(folder) => oracle::certify_cached(point, gamma, eta, &effort, &folder)?,
-                None => oracle::certify_with(point, gamma, eta, &effort)?,
+            let mut effort = oracle::Effort::default();
+            effort.lattice.cell = args.cell.unwrap_or(effort.lattice.cell);
+            effort.lattice.velocity = args.velocity.unwrap_or(effort.lattice.velocity);
+            let certified = match (oracle::cache_folder(), args.anew) {
+                (None, _) => oracle::certify_with(point, gamma, eta, &effort)?,
+                (Some(folder), true) => oracle::certify_anew(point, gamma, eta, &effort, &folder)?,
+                (Some(folder), false) => {
+                    oracle::certify_cached(point, gamma, eta, &effort, &folder)?
+                }
             };
             answer::give(&certified, args.json)
         }

@@ -128,6 +128,7 @@ fn realistic_of(dir: &Path, seeds: u64) {
                 optimum,
                 regret: optimum - law(lava).cvar(1.0 / eta),
                 antagonist_gap: gap,
+                regret_standard_error: 0.0,
                 antagonist_gap_standard_error: if eta > 1.0 { 0.002 } else { 0.0 },
             };
             let mut run = evaluation("lava-grid", eta, seed, plays);
@@ -232,6 +233,7 @@ fn numbers_of_a_run_are_the_known_ones() {
         optimum: 0.5,
         regret: 1.5,
         antagonist_gap: -1e-12,
+        regret_standard_error: 0.0,
         antagonist_gap_standard_error: 0.0,
     });
     store(dir.path(), &run);

@@ -132,13 +132,17 @@ pub struct Audit {
     pub weighted_nominal_standard_error: f64,
 }
 
-/// Exact certificates (grid).
+/// How far a run is from the optimum and from the worst case. On the grid exact; on lava-point against
+/// the oracle and from recorded episodes, with standard errors.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Certificate {
-    /// V*(eta): the optimal CVaR_{1/eta}.
+    /// V*(eta): the optimal CVaR_{1/eta}; the certified CVaR of the oracle's controller on lava-point.
     pub optimum: f64,
-    /// V*(eta) - CVaR_{1/eta} of the greedy policy.
+    /// V*(eta) - CVaR_{1/eta} of the greedy policy; negative where it beats the oracle.
     pub regret: f64,
+    /// Standard error of `regret`; 0 where that is exact.
+    #[serde(default)]
+    pub regret_standard_error: f64,
     /// Value of the greedy protagonist under the learned antagonist minus its CVaR_{1/eta}.
     pub antagonist_gap: f64,
     /// Standard error of `antagonist_gap`; 0 where that is exact.

@@ -199,6 +199,20 @@ pub struct EvaluationOptions {
     /// key.
     #[serde(default = "exhibit_episodes")]
     pub exhibit_episodes: u64,
+    /// What lava-point's regret is measured against; runs of former versions have no such key.
+    #[serde(default)]
+    pub oracle: Oracle,
+}
+
+/// Where the certificate of lava-point's oracle comes from.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Oracle {
+    /// From the program, which has those of the default world; no regret elsewhere.
+    #[default]
+    Shipped,
+    /// Computed where it is not known, which takes minutes.
+    Computed,
 }
 
 /// The default of [`EvaluationOptions::exhibit_episodes`].

@@ -82,16 +82,17 @@ impl Measures {
         Measures::new(run, &laws, alphas, regret, gap, cvar)
     }
 
-    /// The same of redrawn episodes. Certificates come as numbers: the regret's is exact, the gap's
-    /// has a standard error, which stands for its episodes.
+    /// The same of redrawn episodes. Certificates come as numbers, whose standard errors stand for
+    /// their episodes.
     fn redrawn(run: &Run, found: &Measures, alphas: &[f64], random: &mut ChaCha8Rng) -> Measures {
         let laws = Laws::of(run, |law| statistics::redraw(law, random));
         let certificate = run.evaluation.as_ref().and_then(|evaluation| evaluation.certificate);
-        let gap = certificate.map(|certificate| {
+        let mut noisy = |number: f64, standard_error: f64| {
             let noise: f64 = StandardNormal.sample(random);
-            certificate.antagonist_gap + noise * certificate.antagonist_gap_standard_error
-        });
-        let regret = certificate.map(|certificate| certificate.regret);
+            number + noise * standard_error
+        };
+        let gap = certificate.map(|of| noisy(of.antagonist_gap, of.antagonist_gap_standard_error));
+        let regret = certificate.map(|of| noisy(of.regret, of.regret_standard_error));
         let mut measures =
             Measures::new(run, &laws, alphas, regret, gap, |law, alpha| Some(law.cvar(alpha)));
         // A redrawn law counts no episodes; what the original refuses stays refused.

@@ -37,7 +37,7 @@
 //! | `game_value`, `game_value_se` | mean return of the sampled protagonist under its antagonist, and its standard error; at eta = 1, where the antagonist is powerless, `sampled_mean` |
 //! | `greedy_game_value` | mean return of the greedy protagonist under its antagonist; at eta = 1 `greedy_mean` |
 //! | `bound_slack` | `game_value - sampled_cvar`, not below 0 but for sampling error: else the budget leaks |
-//! | `regret` | V*(eta) - greedy CVaR_alpha |
+//! | `regret`, `regret_se` | V*(eta) - greedy CVaR_alpha (lava-point: the oracle's certified CVaR in place of V*), and its standard error |
 //! | `antagonist_gap`, `antagonist_gap_se` | greedy game value - greedy CVaR_alpha, and its standard error |
 //! | `budget_use` | max over audited trajectories of prod delta / eta, at most 1 |
 //! | `budget_violations` | steps or trajectories beyond tolerance, 0 |
@@ -152,6 +152,7 @@ impl Run {
             number(mean(self.game_law(Mode::Greedy))),
             number(mean(game).zip(sampled_cvar).map(|(value, cvar)| value - cvar)),
             number(certificate.map(|certificate| certificate.regret)),
+            number(certificate.map(|certificate| certificate.regret_standard_error)),
             number(certificate.map(|certificate| certificate.antagonist_gap)),
             number(certificate.map(|certificate| certificate.antagonist_gap_standard_error)),
             number(audit.map(|audit| audit.max_budget_use)),
@@ -161,7 +162,7 @@ impl Run {
 }
 
 /// The columns of `runs.csv`.
-pub const COLUMNS: [&str; 30] = [
+pub const COLUMNS: [&str; 31] = [
     "env",
     "eta",
     "seed",
@@ -188,6 +189,7 @@ pub const COLUMNS: [&str; 30] = [
     "greedy_game_value",
     "bound_slack",
     "regret",
+    "regret_se",
     "antagonist_gap",
     "antagonist_gap_se",
     "budget_use",

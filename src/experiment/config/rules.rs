@@ -75,6 +75,7 @@ const RULES: &[(&str, Rule)] = &[
     ("checkpoint.every", COUNT),
     ("evaluation.episodes", Whole(1, 100_000_000)),
     ("evaluation.exhibit_episodes", Whole(1, 100_000_000)),
+    ("evaluation.oracle", Word(&["shipped", "computed"])),
     ("evaluation.parallel_episodes", SIZE),
     ("evaluation.seed", Whole(0, i64::MAX)),
     ("evaluation.alphas", Number(Excluded(0.0), Included(1.0))),

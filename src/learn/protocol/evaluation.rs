@@ -14,11 +14,12 @@ use crate::play::{self, Played, Watcher};
 use crate::weights;
 use cvar_game::exact::antagonist::WorstCase;
 use cvar_game::exact::grid::ExactGrid;
+use cvar_game::exact::oracle;
 use cvar_game::exact::policy::Policy;
 use cvar_game::experiment::artefacts::{
     Audit, Certificate, Chance, LARGEST_FILE, Mode, Play, read_at_most,
 };
-use cvar_game::experiment::config::{Device, RunConfig, WorldConfig};
+use cvar_game::experiment::config::{Device, Oracle, RunConfig, WorldConfig};
 use lava_envs::law::{FiniteLaw, MOVES, sample_index};
 use lava_envs::random::ChaCha8Rng;
 use lava_envs::{ConfigError, GridConfig, LavaGrid, LavaPoint, PointConfig, World};
@@ -321,6 +322,7 @@ impl Yardstick for LavaGrid {
         Ok(Some(Certificate {
             optimum: found.optimal_cvar,
             regret: found.regret,
+            regret_standard_error: 0.0,
             antagonist_gap: found.antagonist_gap(value.0),
             antagonist_gap_standard_error: value.1,
         }))
@@ -405,12 +407,38 @@ impl Yardstick for LavaPoint {
     }
 
     fn certify(
-        _: &PointConfig,
-        _: &RunConfig,
+        constants: &PointConfig,
+        run: &RunConfig,
         _: &Pair<Self>,
-        _: &mut [Play],
+        plays: &mut [Play],
     ) -> Result<Option<Certificate>, RunError> {
-        Ok(None)
+        let (effort, eta) = (oracle::Effort::default(), run.eta.get());
+        let oracle = match run.evaluation.oracle {
+            Oracle::Shipped => oracle::shipped(constants, run.gamma, eta, &effort),
+            Oracle::Computed => Some(match oracle::cache_folder() {
+                Some(folder) => {
+                    oracle::certify_cached(constants, run.gamma, eta, &effort, &folder)?
+                }
+                None => oracle::certify_with(constants, run.gamma, eta, &effort)?,
+            }),
+        };
+        let law = |chance| {
+            let play = plays.iter().find(|p| p.protagonist == Mode::Greedy && p.chance == chance);
+            play.map(|play| &play.law)
+        };
+        let (Some(oracle), Some(greedy)) = (oracle, law(Chance::Nominal)) else { return Ok(None) };
+        let alpha = run.eta.alpha();
+        let (cvar, error) = (greedy.cvar(alpha), greedy.cvar_standard_error(alpha));
+        // At eta = 1 there is no antagonist, and no gap.
+        let (antagonist_gap, value_error) = law(Chance::Antagonist)
+            .map_or((0.0, None), |law| (law.mean() - cvar, Some(law.mean_standard_error())));
+        Ok(Some(Certificate {
+            optimum: oracle.certified_cvar,
+            regret: oracle.certified_cvar - cvar,
+            regret_standard_error: error.hypot(oracle.law.cvar_standard_error(alpha)),
+            antagonist_gap,
+            antagonist_gap_standard_error: value_error.map_or(0.0, |value| value.hypot(error)),
+        }))
     }
 
     fn against_exact(

@@ -3,6 +3,7 @@
 use crate::train::TrainError;
 use crate::weights::WeightsError;
 use cvar_game::exact::ExactError;
+use cvar_game::exact::oracle::OracleError;
 use std::io;
 use std::path::Path;
 
@@ -18,6 +19,9 @@ pub enum RunError {
     /// A yardstick refuses the world.
     #[error(transparent)]
     Exact(#[from] ExactError),
+    /// The oracle refuses the world, or cannot keep its certificate.
+    #[error(transparent)]
+    Oracle(#[from] OracleError),
     /// The weights are not those of the run.
     #[error("final.safetensors does not fit the run: {0}")]
     Weights(#[from] WeightsError),
