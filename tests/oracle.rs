@@ -5,7 +5,7 @@ use cvar_game::exact::oracle::controller::{Controller, Protagonist, Scripted};
 use cvar_game::exact::oracle::lattice::{Scene, Space, cubic};
 use cvar_game::exact::oracle::play::play;
 use cvar_game::exact::oracle::sweep::{Rewards, Utility, smooth, sweep};
-use cvar_game::exact::oracle::{Effort, Lattice, certify_cached, certify_with};
+use cvar_game::exact::oracle::{Effort, Lattice, certify_cached, certify_with, shipped};
 use lava_envs::law::{GaussianLaw, Law};
 use lava_envs::point::Force;
 use lava_envs::random::{Purpose, stream};
@@ -237,6 +237,24 @@ fn certificates_are_kept_under_all_constants() {
     assert_eq!((again.certified_cvar, count()), (first.certified_cvar, 4));
 }
 
+/// The shipped certificates are those of today's default world and effort: whoever changes one of them
+/// has to compute the certificates again.
+#[test]
+fn the_default_world_has_shipped_certificates() {
+    let (config, effort) = (PointConfig::default(), Effort::default());
+    for (eta, promised) in [(1.0, 0.35), (25.0, 0.06), (100.0, -0.03)] {
+        let certified = shipped(&config, 1.0, eta, &effort).expect("it is shipped");
+        assert_eq!((certified.eta, certified.lattice), (eta, effort.lattice));
+        assert!(certified.certified_cvar_lo >= promised, "eta {eta}: {certified}");
+        assert!(certified.episodes >= 200_000);
+        let law = &certified.law;
+        assert!((law.cvar(certified.alpha) - certified.certified_cvar).abs() < 1e-9);
+    }
+    assert_eq!(shipped(&config, 0.99, 25.0, &effort), None, "another discount");
+    assert_eq!(shipped(&config, 1.0, 26.0, &effort), None, "another budget");
+    assert_eq!(shipped(&PointConfig { noise: 1.4, ..config }, 1.0, 25.0, &effort), None);
+}
+
 #[test]
 fn bad_arguments_are_told() {
     let refused = |gamma: f64, eta: f64, lattice: Lattice| {
@@ -263,6 +281,8 @@ fn the_default_lattice_keeps_its_promises_and_a_finer_one_is_not_worse() {
     for (eta, promised) in [(1.0, 0.35), (25.0, 0.06), (100.0, -0.03)] {
         let certified = at(eta, effort.lattice);
         assert!(certified.certified_cvar >= promised, "eta {eta}: {certified}");
+        let known = shipped(&config, 1.0, eta, &Effort::default()).expect("it is shipped");
+        assert!((certified.certified_cvar - known.certified_cvar).abs() < 1e-6, "eta {eta}");
         for baseline in &certified.baselines {
             assert!(certified.certified_cvar_lo > baseline.cvar, "eta {eta}: {baseline:?}");
         }

@@ -18,7 +18,7 @@
 //! All parameters live in one flat vector `[W' | V | b | c]`, where c are the constants of the
 //! actor's head that no observation moves (the log standard deviations of a Gaussian policy).
 //!
-//! The passes are carried out by [`fused`] on the processor and by [`tensors`], which is libtorch, on
+//! The passes are carried out by `fused` on the processor and by `tensors`, which is libtorch, on
 //! other devices; a test holds the two, and libtorch's own derivatives, together.
 
 mod fused;

@@ -1,4 +1,4 @@
-//! Chores of the workspace: `cargo xtask setup`, `test`, `bench`, `speed`.
+//! Chores of the workspace: `cargo xtask setup`, `test`, `bench`, `speed`, `scaling`.
 //!
 //! Training needs libtorch, a C++ library of 480 MB that cargo cannot fetch. `setup` fetches it
 //! once for all checkouts of one user and links it into this one; after that plain `cargo build`,
@@ -7,6 +7,7 @@
 
 mod cache;
 mod libtorch;
+mod scaling;
 mod speed;
 mod tools;
 mod wheels;
@@ -45,6 +46,8 @@ enum Verb {
         #[arg(trailing_var_arg = true, allow_hyphen_values = true)]
         passed_on: Vec<OsString>,
     },
+    /// Set up, then measure what training costs against its sizes; results go to results/speed
+    Scaling,
     /// Set up, then measure the speed of training and its parts; the table goes to target/speed.md
     Speed {
         /// Passed on to the benchmarks, such as a filter of their names: `rollout`
@@ -78,6 +81,13 @@ fn run(verb: Verb) -> Result<ExitCode> {
             let bench = ["--", "bench", "--config", "configs/quick.toml"];
             let run = ["run", "--release", "--bin", "cvar-game"];
             cargo(&repository, &[run, bench].concat(), &passed_on)
+        }
+        Verb::Scaling => {
+            let code = cargo(&repository, &["build", "--release", "--bins"], &[])?;
+            if code == ExitCode::SUCCESS {
+                scaling::measure(&repository, &speed::target(&repository))?;
+            }
+            Ok(code)
         }
         Verb::Speed { passed_on } => {
             let target = speed::target(&repository);

@@ -1,4 +1,4 @@
-//! The network's passes on the processor: [`SAMPLES`] samples at a time, from the inputs to the gradient,
+//! The network's passes on the processor: `SAMPLES` samples at a time, from the inputs to the gradient,
 //! without leaving the first-level cache.
 //!
 //! With so few inputs and outputs, general matrix products spend most of their time on packing, and

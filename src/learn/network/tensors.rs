@@ -76,7 +76,7 @@ impl Tensors {
         download(&self.second.narrow(0, row, rows).narrow(1, unit, hidden).mm(&h), outputs);
     }
 
-    /// Outputs and gradient in one, as [`super::Network::differentiate`]; the whole batch is one block.
+    /// Outputs and gradient in one, as in `Network::differentiate`; the whole batch is one block.
     pub fn differentiate(
         &mut self,
         parameters: &[f32],

@@ -1,0 +1,226 @@
+//! What a training run costs against its sizes: parallel episodes, hidden units, horizon, jobs.
+//!
+//! Runs the release build of `cvar-game` and writes `scaling.md`, `scaling.csv` and `scaling.svg` to
+//! `results/speed`. Every size is measured several times in an order that alternates between sizes, so
+//! that a drift of the machine hits all of them; the median counts.
+
+use std::fmt::Write as _;
+use std::path::Path;
+use std::process::{Command, Stdio};
+
+use anyhow::{Context, Result, bail};
+use plotters::prelude::*;
+
+/// Measurements of each size.
+const REPEATS: usize = 5;
+
+/// One question: a name, the option that is changed, its values, and how the option is written.
+struct Axis {
+    name: &'static str,
+    unit: &'static str,
+    values: &'static [u64],
+    options: fn(u64) -> Vec<String>,
+}
+
+/// An update every 10,000 environment steps, whatever the number of parallel episodes.
+const STEPS: u64 = 600_000;
+
+const AXES: [Axis; 3] = [
+    Axis {
+        name: "parallel episodes",
+        unit: "episodes, 10,000 steps per update throughout",
+        values: &[64, 250, 1_000, 4_096],
+        options: |n| {
+            let steps = (10_000 / n).max(1);
+            vec![
+                format!("train.parallel_episodes={n}"),
+                format!("train.rollout_steps={steps}"),
+                format!("train.protagonist.minibatch={}", 2_500.min(n * steps)),
+                format!("train.antagonist.minibatch={}", 2_500.min(n * steps)),
+            ]
+        },
+    },
+    Axis {
+        name: "hidden units",
+        unit: "units of actor and of critic each",
+        values: &[32, 64, 128, 256, 512],
+        options: |n| {
+            vec![format!("train.protagonist.hidden={n}"), format!("train.antagonist.hidden={n}")]
+        },
+    },
+    Axis {
+        name: "horizon",
+        unit: "steps T, and steps of a rollout",
+        values: &[20, 40, 80, 160],
+        options: |n| vec![format!("env.horizon={n}"), format!("train.rollout_steps={n}")],
+    },
+];
+
+const WORLDS: [&str; 2] = ["lava-grid", "lava-point"];
+
+/// Environment steps per second of training, by world, axis and value, and of one and two jobs.
+pub fn measure(repository: &Path, target: &Path) -> Result<()> {
+    let program = target.join("release").join("cvar-game");
+    let mut speeds =
+        vec![Vec::new(); WORLDS.len() * AXES.iter().map(|a| a.values.len()).sum::<usize>()];
+    let mut jobs = [const { Vec::new() }; 2];
+    for repeat in 0..REPEATS {
+        eprintln!("round {} of {REPEATS}", repeat + 1);
+        let mut index = 0;
+        for world in WORLDS {
+            for axis in &AXES {
+                for &value in axis.values {
+                    speeds[index].push(train(&program, world, &(axis.options)(value))?);
+                    index += 1;
+                }
+            }
+        }
+        for (count, seconds) in jobs.iter_mut().enumerate() {
+            seconds.push(sweep(&program, count + 1)?);
+        }
+    }
+    let folder = repository.join("results").join("speed");
+    std::fs::create_dir_all(&folder)?;
+    let speeds: Vec<f64> = speeds.into_iter().map(median).collect();
+    let gain = median(jobs[0].clone()) / median(jobs[1].clone());
+    std::fs::write(folder.join("scaling.csv"), csv(&speeds))?;
+    std::fs::write(folder.join("scaling.md"), document(&speeds, gain))?;
+    draw(&folder.join("scaling.svg"), &speeds)?;
+    println!("{}", document(&speeds, gain));
+    Ok(())
+}
+
+/// Environment steps per second of one run.
+fn train(program: &Path, world: &str, options: &[String]) -> Result<f64> {
+    let out = tempfile::tempdir()?;
+    let mut command = Command::new(program);
+    command.args(["train", "--json", "--eta", "25", "--seed", "1", "--env", world, "--steps"]);
+    command.arg(STEPS.to_string()).arg("--out").arg(out.path());
+    command.args(["--set", "evaluation.episodes=100", "--set", "evaluation.exhibit_episodes=100"]);
+    for option in options {
+        command.arg("--set").arg(option);
+    }
+    let output = command.output().context("cvar-game could not be started")?;
+    if !output.status.success() {
+        bail!("cvar-game failed: {}", String::from_utf8_lossy(&output.stderr));
+    }
+    let answer: serde_json::Value = serde_json::from_slice(&output.stdout)?;
+    answer["steps_per_second"].as_f64().context("the run tells no speed")
+}
+
+/// Seconds of a sweep of four equal runs in so many jobs.
+fn sweep(program: &Path, jobs: usize) -> Result<f64> {
+    let out = tempfile::tempdir()?;
+    let config = out.path().join("four.toml");
+    std::fs::write(
+        &config,
+        "[experiment]\nenvs = [\"lava-grid\"]\netas = [25]\nseeds = [1, 2, 3, 4]\n\
+         [train]\nsteps = 1_500_000\n[evaluation]\nepisodes = 100\nexhibit_episodes = 100\n",
+    )?;
+    let start = std::time::Instant::now();
+    let mut command = Command::new(program);
+    command.arg("bench").arg("--config").arg(&config).arg("--out").arg(out.path().join("out"));
+    command.args(["--jobs", &jobs.to_string()]).stdout(Stdio::null()).stderr(Stdio::null());
+    if !command.status()?.success() {
+        bail!("the sweep failed");
+    }
+    Ok(start.elapsed().as_secs_f64())
+}
+
+fn median(mut numbers: Vec<f64>) -> f64 {
+    numbers.sort_by(f64::total_cmp);
+    numbers[numbers.len() / 2]
+}
+
+/// World, axis, value and speed of every measurement.
+fn rows(speeds: &[f64]) -> impl Iterator<Item = (&'static str, &'static Axis, u64, f64)> + '_ {
+    let keys = WORLDS.into_iter().flat_map(|world| {
+        AXES.iter().flat_map(move |axis| axis.values.iter().map(move |&value| (world, axis, value)))
+    });
+    keys.zip(speeds).map(|((world, axis, value), &speed)| (world, axis, value, speed))
+}
+
+fn csv(speeds: &[f64]) -> String {
+    let mut text = "env,axis,value,steps_per_second\n".to_owned();
+    for (world, axis, value, speed) in rows(speeds) {
+        let _ = writeln!(text, "{world},{},{value},{speed:.0}", axis.name);
+    }
+    text
+}
+
+fn document(speeds: &[f64], gain: f64) -> String {
+    let mut text = format!(
+        "# What training costs\n\nEnvironment steps per second of one run on one core, eta = 25, \
+         {STEPS} steps; medians of {REPEATS} runs, in an order that alternates between the sizes. All \
+         else is as in `configs/default.toml` (250 parallel episodes, 64 hidden units, T = 40). Made by \
+         `cargo xtask scaling` on a machine that did nothing else; compare within this page alone.\n\n\
+         ![steps per second against the sizes](scaling.svg)\n"
+    );
+    for axis in &AXES {
+        let _ = write!(text, "\n## {}\n\nIn {}.\n\n| |", capital(axis.name), axis.unit);
+        for value in axis.values {
+            let _ = write!(text, " {value} |");
+        }
+        let _ = write!(text, "\n|---|{}\n", "---:|".repeat(axis.values.len()));
+        for world in WORLDS {
+            let _ = write!(text, "| {world} |");
+            for (_, _, _, speed) in rows(speeds).filter(|r| r.0 == world && r.1.name == axis.name) {
+                let _ = write!(text, " {:.0}k |", speed / 1e3);
+            }
+            text.push('\n');
+        }
+    }
+    let _ = write!(
+        text,
+        "\n## Jobs\n\nFour equal runs in two jobs take 1/{gain:.2} of the time in one job, evaluation and \
+         reports included.\n"
+    );
+    text
+}
+
+fn capital(name: &str) -> String {
+    let mut letters = name.chars();
+    letters.next().map_or_else(String::new, |first| first.to_uppercase().chain(letters).collect())
+}
+
+/// A panel per axis: steps per second against its values, a line per world.
+fn draw(path: &Path, speeds: &[f64]) -> Result<()> {
+    let colours = [RGBColor(0x00, 0x72, 0xB2), RGBColor(0xD5, 0x5E, 0x00)];
+    let area = SVGBackend::new(path, (1080, 340)).into_drawing_area();
+    area.fill(&WHITE)?;
+    let top = speeds.iter().copied().fold(0.0, f64::max) * 1.1 / 1e3;
+    for (panel, axis) in area.split_evenly((1, AXES.len())).iter().zip(&AXES) {
+        let (first, last) = (axis.values[0] as f64, *axis.values.last().unwrap_or(&1) as f64);
+        let mut chart = ChartBuilder::on(panel)
+            .caption(axis.name, ("sans-serif", 18))
+            .margin(10)
+            .x_label_area_size(30)
+            .y_label_area_size(48)
+            .build_cartesian_2d((first / 1.2..last * 1.2).log_scale(), 0.0..top)?;
+        chart
+            .configure_mesh()
+            .disable_x_mesh()
+            .label_style(("sans-serif", 14))
+            .y_desc("thousand steps per second")
+            .x_labels(4)
+            .x_label_formatter(&|x| format!("{x:.0}"))
+            .draw()?;
+        for (world, colour) in WORLDS.into_iter().zip(colours) {
+            let points: Vec<(f64, f64)> = rows(speeds)
+                .filter(|row| row.0 == world && row.1.name == axis.name)
+                .map(|(_, _, value, speed)| (value as f64, speed / 1e3))
+                .collect();
+            chart
+                .draw_series(LineSeries::new(points.clone(), colour.stroke_width(2)).point_size(3))?
+                .label(world)
+                .legend(move |(x, y)| PathElement::new([(x, y), (x + 16, y)], colour));
+        }
+        chart
+            .configure_series_labels()
+            .label_font(("sans-serif", 14))
+            .position(SeriesLabelPosition::LowerLeft)
+            .draw()?;
+    }
+    area.present()?;
+    Ok(())
+}
