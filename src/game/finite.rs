@@ -92,9 +92,10 @@ impl Perturbation for FinitePerturbation {
         sample_index(&self.perturbed, random)
     }
 
-    fn score(&self, outcome: usize, gradient: &mut [f64]) {
+    fn score(&self, outcome: usize, gradient: &mut [f64]) -> f64 {
         gradient.fill(0.0);
         self.add_ratio_gradient(outcome, 1.0 / self.ratio[outcome], gradient);
+        self.ratio[outcome]
     }
 
     /// H(q) = -sum q log q of the perturbed law q = P delta.

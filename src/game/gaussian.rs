@@ -188,7 +188,7 @@ impl Perturbation for GaussianPerturbation {
         if bump { self.mean() + square_root(&self.covariance) * z } else { z }
     }
 
-    fn score(&self, xi: Vector2<f64>, gradient: &mut [f64]) {
+    fn score(&self, xi: Vector2<f64>, gradient: &mut [f64]) -> f64 {
         let base = self.base(xi);
         let (by_base, by_supremum) = self.mixing.derivatives(base);
         let ratio = self.mixing.likelihood_ratio(base);
@@ -202,6 +202,7 @@ impl Perturbation for GaussianPerturbation {
             supremum_curvature * through_supremum - off * off.transpose() * (0.5 * direct),
             gradient,
         );
+        ratio
     }
 
     /// The entropy of a mixture has no closed form. By concavity it is at least

@@ -44,8 +44,8 @@ pub trait Perturbation {
     /// Draws an outcome from the perturbed law P_t delta_t.
     fn sample<R: Rng>(&self, random: &mut R) -> <Self::Law as Law>::Outcome;
 
-    /// Writes the gradient of log delta_t(o) by the family's parameters.
-    fn score(&self, outcome: <Self::Law as Law>::Outcome, gradient: &mut [f64]);
+    /// Writes the gradient of log delta_t(o) by the family's parameters; answers with delta_t(o).
+    fn score(&self, outcome: <Self::Law as Law>::Outcome, gradient: &mut [f64]) -> f64;
 
     /// The entropy of the perturbed law in nats, or the family's lower bound of it, and its
     /// gradient by the family's parameters.

@@ -22,9 +22,9 @@ pub const MAX_PARAMETERS: usize = 8;
 /// no observation moves.
 pub trait Head: Clone + std::fmt::Debug {
     /// What the law depends on beside its parameters.
-    type Given: Copy;
+    type Given: Copy + std::fmt::Debug;
     /// What is chosen.
-    type Choice: Copy;
+    type Choice: Copy + std::fmt::Debug;
 
     /// Number of outputs of the actor.
     fn outputs(&self) -> usize;
@@ -124,6 +124,9 @@ impl Policy for CategoricalPolicy {
     }
 }
 
+/// log(2 pi).
+const LOG_2_PI: f64 = 1.837_877_066_409_345_3;
+
 /// Gaussian over forces in the plane: the actor's outputs are the mean, the constants the log
 /// standard deviations. Its density is that of the draw itself, before the world scales a force
 /// longer than 1 onto the unit disc.
@@ -149,7 +152,7 @@ impl Head for GaussianPolicy {
         (0..2)
             .map(|i| {
                 let z = (choice.0[i] - parameters[i]) / parameters[2 + i].exp();
-                -0.5 * z * z - parameters[2 + i] - 0.5 * (2.0 * std::f64::consts::PI).ln()
+                -0.5 * z * z - parameters[2 + i] - 0.5 * LOG_2_PI
             })
             .sum()
     }
@@ -157,12 +160,13 @@ impl Head for GaussianPolicy {
     fn gradients(
         &self,
         parameters: &[f64],
-        given: &(),
+        _: &(),
         choice: &Force,
         score: &mut [f64],
         entropy_gradient: &mut [f64],
     ) -> (f64, f64) {
-        let mut entropy = 1.0 + (2.0 * std::f64::consts::PI).ln();
+        let mut entropy = 1.0 + LOG_2_PI;
+        let mut log_probability = 0.0;
         for i in 0..2 {
             let std = parameters[2 + i].exp();
             let z = (choice.0[i] - parameters[i]) / std;
@@ -171,8 +175,9 @@ impl Head for GaussianPolicy {
             entropy_gradient[i] = 0.0;
             entropy_gradient[2 + i] = 1.0;
             entropy += parameters[2 + i];
+            log_probability += -0.5 * z * z - parameters[2 + i] - 0.5 * LOG_2_PI;
         }
-        (self.log_probability(parameters, given, choice), entropy)
+        (log_probability, entropy)
     }
 }
 
@@ -220,8 +225,8 @@ impl<F: Family> Head for AntagonistHead<F> {
         entropy_gradient: &mut [f64],
     ) -> (f64, f64) {
         let perturbation = self.0.perturbation(parameters, law, *budget);
-        perturbation.score(*outcome, score);
+        let ratio = perturbation.score(*outcome, score);
         let entropy = perturbation.entropy(entropy_gradient);
-        (law.log_density(*outcome) + perturbation.likelihood_ratio(*outcome).ln(), entropy)
+        (law.log_density(*outcome) + ratio.ln(), entropy)
     }
 }

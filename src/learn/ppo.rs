@@ -23,12 +23,39 @@ use tch::Device;
 
 /// A player: the head that gives its outputs a meaning, its networks and its optimiser.
 #[derive(Debug)]
-pub struct Player<H> {
+pub struct Player<H: Head> {
     /// What the actor's outputs mean.
     pub head: H,
     /// Actor and critic.
     pub network: Network,
     optimiser: Adam,
+    workspace: Workspace<H>,
+}
+
+/// What an update fills; kept, as fresh memory costs more than filling it.
+#[derive(Debug)]
+struct Workspace<H: Head> {
+    values: Vec<f32>,
+    advantages: Vec<f32>,
+    samples: Vec<Sample<H>>,
+    order: Vec<usize>,
+    inputs: Vec<f32>,
+    batch: Vec<Sample<H>>,
+    gradient: Vec<f32>,
+}
+
+impl<H: Head> Default for Workspace<H> {
+    fn default() -> Self {
+        Workspace {
+            values: Vec::new(),
+            advantages: Vec::new(),
+            samples: Vec::new(),
+            order: Vec::new(),
+            inputs: Vec::new(),
+            batch: Vec::new(),
+            gradient: Vec::new(),
+        }
+    }
 }
 
 /// What an update reports, under the names that CleanRL's users know; means over its minibatches.
@@ -116,7 +143,7 @@ impl<H: Head> Player<H> {
         let shape = network.shape();
         assert!(shape.outputs + shape.constants <= MAX_PARAMETERS, "parameters of the head");
         let optimiser = Adam::new(shape.parameters());
-        Player { head, network, optimiser }
+        Player { head, network, optimiser, workspace: Workspace::default() }
     }
 
     /// What of the player is not a finite number, or will not be when it plays.
@@ -180,36 +207,34 @@ impl<H: Head> Player<H> {
         rates: Rates,
         random: &mut ChaCha8Rng,
     ) -> Losses {
-        let (mut values, mut advantages) = (Vec::new(), Vec::new());
-        self.network.values(&trajectories.inputs, &mut values);
+        let Workspace { values, advantages, samples, order, inputs, batch, gradient } =
+            &mut self.workspace;
+        self.network.values(&trajectories.inputs, values);
         gae::advantages(
             &trajectories.rewards,
             &trajectories.ended,
-            &values,
+            values,
             trajectories.slots,
             gamma,
             options.gae_lambda,
-            &mut advantages,
+            advantages,
         );
-        let samples: Vec<Sample<H>> = (0..advantages.len())
-            .map(|i| Sample {
-                given: trajectories.given[i],
-                choice: trajectories.choices[i],
-                log_probability: trajectories.log_probabilities[i],
-                advantage: advantages[i],
-                target: advantages[i] + values[i],
-            })
-            .collect();
+        samples.clear();
+        samples.extend((0..advantages.len()).map(|i| Sample {
+            given: trajectories.given[i],
+            choice: trajectories.choices[i],
+            log_probability: trajectories.log_probabilities[i],
+            advantage: advantages[i],
+            target: advantages[i] + values[i],
+        }));
 
         let row = self.network.shape().width();
-        let mut order: Vec<usize> = (0..samples.len()).collect();
-        let mut losses = Losses {
-            explained_variance: explained_variance(&samples, &values),
-            ..Losses::default()
-        };
+        order.clear();
+        order.extend(0..samples.len());
+        let mut losses =
+            Losses { explained_variance: explained_variance(samples, values), ..Losses::default() };
         let minibatches = samples.len().div_ceil(options.minibatch) as f64;
         let weight = 1.0 / (minibatches * f64::from(options.epochs));
-        let (mut inputs, mut batch, mut gradient) = (Vec::new(), Vec::new(), Vec::new());
         for _ in 0..options.epochs {
             order.shuffle(random);
             for indices in order.chunks(options.minibatch) {
@@ -220,15 +245,15 @@ impl<H: Head> Player<H> {
                     batch.push(samples[i].clone());
                 }
                 let constants = self.network.constants().to_vec();
-                let mut loss = Loss::new(&self.head, &batch, options, rates.entropy, &constants);
-                self.network.differentiate(&inputs, &mut gradient, |block| loss.add(block));
+                let mut loss = Loss::new(&self.head, batch, options, rates.entropy, &constants);
+                self.network.differentiate(inputs, gradient, |block| loss.add(block));
                 let at = gradient.len() - constants.len();
                 let mut step = loss.finish(&mut gradient[at..]);
-                step.gradient_norm = clip_norm(&mut gradient, options.gradient_norm);
+                step.gradient_norm = clip_norm(gradient, options.gradient_norm);
                 losses.add(&step, weight);
                 let optimiser = &mut self.optimiser;
                 self.network.change(|parameters| {
-                    optimiser.step(parameters, &gradient, rates.learning_rate);
+                    optimiser.step(parameters, gradient, rates.learning_rate);
                 });
             }
         }
