@@ -12,7 +12,7 @@ use anyhow::{Context, Result, bail};
 use plotters::prelude::*;
 
 /// Measurements of each size.
-const REPEATS: usize = 5;
+const REPEATS: usize = 3;
 
 /// One question: a name, the option that is changed, its values, and how the option is written.
 struct Axis {
@@ -23,7 +23,7 @@ struct Axis {
 }
 
 /// An update every 10,000 environment steps, whatever the number of parallel episodes.
-const STEPS: u64 = 600_000;
+const STEPS: u64 = 300_000;
 
 const AXES: [Axis; 3] = [
     Axis {
@@ -115,7 +115,7 @@ fn sweep(program: &Path, jobs: usize) -> Result<f64> {
     std::fs::write(
         &config,
         "[experiment]\nenvs = [\"lava-grid\"]\netas = [25]\nseeds = [1, 2, 3, 4]\n\
-         [train]\nsteps = 1_500_000\n[evaluation]\nepisodes = 100\nexhibit_episodes = 100\n",
+         [train]\nsteps = 1_000_000\n[evaluation]\nepisodes = 100\nexhibit_episodes = 100\n",
     )?;
     let start = std::time::Instant::now();
     let mut command = Command::new(program);
