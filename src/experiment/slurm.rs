@@ -88,7 +88,7 @@ exit "$code"
     );
     let after = format!(
         "#!/bin/bash\n#SBATCH --job-name=cvar-game-table\n#SBATCH --cpus-per-task=1\n\
-         {program} table {results}\n"
+         {program} report {results}\n"
     );
 
     write_in_place(&config_file, config.to_toml().as_bytes())?;

@@ -18,14 +18,14 @@ pub(super) const GOAL: RGBColor = RGBColor(0x00, 0x9E, 0x73);
 /// Size of the words in panels, in the canvas's units.
 pub(super) const TEXT: u32 = 26;
 
-/// Okabe & Ito's colours but for yellow, which white swallows.
+/// Okabe & Ito's colours but for yellow, which white swallows; those of goal and lava last.
 const COLOURS: [RGBColor; 6] = [
     RGBColor(0x00, 0x72, 0xB2),
-    RGBColor(0xD5, 0x5E, 0x00),
-    RGBColor(0x00, 0x9E, 0x73),
     RGBColor(0xCC, 0x79, 0xA7),
     RGBColor(0xE6, 0x9F, 0x00),
     RGBColor(0x56, 0xB4, 0xE9),
+    GOAL,
+    LAVA,
 ];
 
 /// The colour of the eta in this place.
