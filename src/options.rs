@@ -31,14 +31,16 @@ pub struct TrainOptions {
     pub response: f64,
     /// Hides the remaining budget from the antagonist (an ablation).
     pub hide_budget: bool,
+    /// Whether the antagonist's gradient counts what it spends (see `cvar_learn::price`).
+    pub price_budget: bool,
     /// The protagonist.
     pub protagonist: PlayerOptions,
     /// Standard deviation of a Gaussian protagonist's actions at the start (continuous actions).
     pub initial_std: f64,
     /// The antagonist.
     pub antagonist: PlayerOptions,
-    /// What the bump of the antagonist's likelihood ratio is confined to (Gaussian chance).
-    pub bump: BumpBounds,
+    /// What the antagonist's likelihood ratio is made of (Gaussian chance).
+    pub bump: BumpOptions,
 }
 
 impl TrainOptions {
@@ -117,10 +119,12 @@ pub struct PlayerOptions {
     pub gradient_norm: f64,
 }
 
-/// Bounds of the antagonist's bump exp(-1/2 (xi-c)' K (xi-c)); they keep log M finite.
+/// The antagonist's bumps exp(-1/2 (xi-c)' K (xi-c)) and their bounds, which keep log M finite.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub struct BumpBounds {
+pub struct BumpOptions {
+    /// Number of bumps whose weighted sum the likelihood ratio is.
+    pub count: usize,
     /// Bound of |c|, in standard deviations of the noise.
     pub center: f64,
     /// Bound of the eigenvalues of K.

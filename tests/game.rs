@@ -3,8 +3,9 @@
 
 use approx::assert_relative_eq;
 use cvar_game::game::budget::{Budget, Eta};
+use cvar_game::game::bump::{self, Bump};
 use cvar_game::game::finite::FiniteFamily;
-use cvar_game::game::gaussian::GaussianFamily;
+use cvar_game::game::gaussian::{GaussianFamily, MAX_BUMPS};
 use cvar_game::game::perturbation::{Family, Perturbation};
 use lava_envs::{FiniteLaw, GaussianLaw, Law};
 use nalgebra::{Matrix2, Vector2};
@@ -12,7 +13,17 @@ use proptest::prelude::*;
 use rand::SeedableRng;
 use rand::rngs::ChaCha8Rng;
 
-const FAMILY: GaussianFamily = GaussianFamily { center_bound: 4.0, curvature_bound: 50.0 };
+fn family(bumps: usize) -> GaussianFamily {
+    GaussianFamily { bumps, center_bound: 4.0, curvature_bound: 50.0 }
+}
+
+/// A family with its parameters, the logits of its weights included.
+fn gaussians(range: std::ops::Range<f64>) -> impl Strategy<Value = (GaussianFamily, Vec<f64>)> {
+    (1..=MAX_BUMPS).prop_flat_map(move |bumps| {
+        let count = family(bumps).parameters();
+        (Just(family(bumps)), prop::collection::vec(range.clone(), count))
+    })
+}
 
 fn budget(eta: f64) -> Budget {
     Budget::start(Eta::new(eta).unwrap())
@@ -109,18 +120,24 @@ proptest! {
 
     #[test]
     fn gaussian_perturbations_are_admissible(
-        parameters in prop::array::uniform5(-5.0f64..5.0),
+        (family, parameters) in gaussians(-5.0..5.0),
         xi in prop::array::uniform2(-5.0f64..5.0),
         eta in budgets(),
     ) {
-        let perturbation = FAMILY.perturbation(&parameters, &GaussianLaw, budget(eta));
+        let perturbation = family.perturbation(&parameters, &GaussianLaw, budget(eta));
         prop_assert!(perturbation.supremum() <= eta * (1.0 + 1e-9));
         let ratio = perturbation.likelihood_ratio(Vector2::from(xi));
         prop_assert!(ratio > 0.0 || eta > 1.0);
         prop_assert!(ratio <= perturbation.supremum() * (1.0 + 1e-12));
         prop_assert!(perturbation.normalisation_error() < 1e-9);
-        prop_assert!(perturbation.center().norm() < FAMILY.center_bound);
-        prop_assert!(perturbation.curvature().symmetric_eigenvalues().max() <= FAMILY.curvature_bound);
+        let mut sum = 0.0;
+        for (weight, bump) in perturbation.bumps() {
+            prop_assert!(bump.center().norm() < family.center_bound);
+            let largest = bump.curvature().symmetric_eigenvalues().max();
+            prop_assert!(largest <= family.curvature_bound);
+            sum += weight;
+        }
+        prop_assert!((sum - 1.0).abs() < 1e-12);
         if eta == 1.0 {
             prop_assert_eq!(ratio, 1.0);
         }
@@ -155,91 +172,114 @@ proptest! {
 
     #[test]
     fn gaussian_gradients_equal_finite_differences(
-        parameters in prop::array::uniform5(-2.0f64..2.0),
+        (family, parameters) in gaussians(-2.0..2.0),
         xi in prop::array::uniform2(-3.0f64..3.0),
         eta in prop_oneof![Just(1.0), 1.05f64..200.0],
     ) {
-        let at = |x: &[f64]| FAMILY.perturbation(x, &GaussianLaw, budget(eta));
-        let supremum = at(&parameters).log_supremum().exp();
-        prop_assume!((supremum - eta).abs() > 1e-2 * eta);
+        let at = |x: &[f64]| family.perturbation(x, &GaussianLaw, budget(eta));
+        prop_assume!((at(&parameters).base_supremum() - eta).abs() > 1e-2 * eta);
         let xi = Vector2::from(xi);
-        let mut gradient = [0.0; 5];
+        let mut gradient = vec![0.0; parameters.len()];
         at(&parameters).score(xi, &mut gradient);
         assert_gradient(&gradient, &differences(|x| at(x).likelihood_ratio(xi).ln(), &parameters));
-        let mut scratch = [0.0; 5];
+        let scratch = gradient.clone();
         at(&parameters).entropy(&mut gradient);
-        assert_gradient(&gradient, &differences(|x| at(x).entropy(&mut scratch.clone()), &parameters));
-        scratch.fill(0.0);
+        let entropy = |x: &[f64]| at(x).entropy(&mut scratch.clone());
+        assert_gradient(&gradient, &differences(entropy, &parameters));
     }
 }
 
 proptest! {
     #![proptest_config(ProptestConfig::with_cases(40))]
 
-    /// Z, M, m, S and the density of the bump against quadrature of their definitions.
+    /// Z, M, m and S of a bump against quadrature of their definitions.
     #[test]
-    fn the_bump_equals_quadrature(
-        parameters in prop::array::uniform5(-6.0f64..6.0),
-        eta in prop_oneof![
-            (1e-9f64..1e-3).prop_map(|x| 1.0 + x), 1.0f64..200.0, Just(1e12),
-        ],
-    ) {
-        let perturbation = FAMILY.perturbation(&parameters, &GaussianLaw, budget(eta));
-        let (c, k) = (perturbation.center(), perturbation.curvature());
+    fn a_bump_equals_quadrature(parameters in prop::array::uniform5(-6.0f64..6.0)) {
+        let bump = Bump::new(&parameters, 0.1, 4.0, 50.0);
+        let (c, k) = (bump.center(), bump.curvature());
         let kernel = |xi: Vector2<f64>| {
             (GaussianLaw.log_density(xi) - 0.5 * (xi - c).dot(&(k * (xi - c)))).exp()
         };
         let z = integrate(kernel, Vector2::zeros(), 10.0, 800);
-        assert_relative_eq!(perturbation.log_supremum(), -z.ln(), epsilon = 1e-7);
+        assert_relative_eq!(bump.log_supremum(), -z.ln(), epsilon = 1e-7);
+        assert_relative_eq!(bump.log_integral(), z.ln(), epsilon = 1e-7);
 
         let mean = |i: usize| integrate(|xi| xi[i] * kernel(xi), Vector2::zeros(), 10.0, 800) / z;
         let m = Vector2::new(mean(0), mean(1));
-        assert_relative_eq!(perturbation.mean(), m, epsilon = 1e-7);
+        assert_relative_eq!(bump.mean(), m, epsilon = 1e-7);
         let second = |i: usize, j: usize| {
             let f = |xi: Vector2<f64>| (xi[i] - m[i]) * (xi[j] - m[j]) * kernel(xi);
             integrate(f, Vector2::zeros(), 10.0, 800) / z
         };
         let s = Matrix2::new(second(0, 0), second(0, 1), second(0, 1), second(1, 1));
-        assert_relative_eq!(perturbation.covariance(), s, epsilon = 1e-7);
+        assert_relative_eq!(bump.covariance(), s, epsilon = 1e-7);
+        let xi = Vector2::new(0.3, -0.7);
+        assert_relative_eq!(
+            bump.likelihood_ratio(xi).ln(), (kernel(xi) / z).ln() - GaussianLaw.log_density(xi),
+            epsilon = 1e-6
+        );
+    }
 
+    /// The perturbed density integrates to 1, and M bounds the ratio; it is attained by one bump.
+    #[test]
+    fn sums_of_bumps_equal_quadrature(
+        (family, parameters) in gaussians(-6.0..6.0),
+        eta in prop_oneof![
+            (1e-9f64..1e-3).prop_map(|x| 1.0 + x), 1.0f64..200.0, Just(1e12),
+        ],
+    ) {
+        let perturbation = family.perturbation(&parameters, &GaussianLaw, budget(eta));
         let density = |xi: Vector2<f64>| {
             GaussianLaw.log_density(xi).exp() * perturbation.likelihood_ratio(xi)
         };
         let total = integrate(density, Vector2::zeros(), 10.0, 800);
         prop_assert!((total - 1.0).abs() < 1e-6, "E[delta] = {total}");
-        // The supremum is attained at c and nowhere exceeded around it.
-        let top = perturbation.likelihood_ratio(c);
-        assert_relative_eq!(top, perturbation.supremum(), max_relative = 1e-9);
-        assert_relative_eq!(
-            top, perturbation.log_supremum().exp().min(eta), max_relative = 1e-9
-        );
-        for step in 0..8 {
-            let angle = f64::from(step) * std::f64::consts::FRAC_PI_4;
-            let near = c + Vector2::new(angle.cos(), angle.sin()) * 0.1;
-            prop_assert!(perturbation.likelihood_ratio(near) <= top);
+        for (_, bump) in perturbation.bumps() {
+            let c = bump.center();
+            let top = perturbation.likelihood_ratio(c);
+            prop_assert!(top <= perturbation.supremum() * (1.0 + 1e-12));
+            if family.bumps == 1 {
+                let supremum = perturbation.base_supremum().min(eta);
+                assert_relative_eq!(top, supremum, max_relative = 1e-9);
+                for step in 0..8 {
+                    let angle = f64::from(step) * std::f64::consts::FRAC_PI_4;
+                    let near = c + Vector2::new(angle.cos(), angle.sin()) * 0.1;
+                    prop_assert!(perturbation.likelihood_ratio(near) <= top);
+                }
+            }
         }
     }
 }
 
 /// Draws follow the density: first and second moments of the mixture.
 #[test]
-fn draws_of_the_bump_follow_its_mixture() {
-    let perturbation = FAMILY.perturbation(&[0.8, -0.5, 0.1, 0.2, 0.3], &GaussianLaw, budget(6.0));
-    let mut random = ChaCha8Rng::seed_from_u64(7);
-    let n = 400_000;
-    let draws: Vec<_> = (0..n).map(|_| perturbation.sample(&mut random)).collect();
-    let (weight, m) = (perturbation.weight(), perturbation.mean());
-    assert!(weight > 0.05 && weight < 1.0, "the budget should bind: {weight}");
-    let mean = draws.iter().sum::<Vector2<f64>>() / f64::from(n);
-    assert!((mean - m * weight).norm() < 0.01, "{mean} against {}", m * weight);
-    let second: Matrix2<f64> =
-        draws.iter().map(|d| d * d.transpose()).sum::<Matrix2<f64>>() / f64::from(n);
-    let expected = Matrix2::identity() * (1.0 - weight)
-        + (perturbation.covariance() + m * m.transpose()) * weight;
-    assert!((second - expected).norm() < 0.02, "{second} against {expected}");
-    // Importance weights undo the perturbation: E_Q[1/delta] = 1.
-    let back: f64 = draws.iter().map(|&d| 1.0 / perturbation.likelihood_ratio(d)).sum();
-    assert!((back / f64::from(n) - 1.0).abs() < 0.01);
+fn draws_follow_their_mixture() {
+    let one = [0.8, -0.5, 0.1, 0.2, 0.3].to_vec();
+    let two = [one.clone(), [-0.6, 0.2, 0.4, -0.1, 0.2, 0.3, -0.2].to_vec()].concat();
+    for parameters in [one, two] {
+        let family = family(parameters.len() / bump::PARAMETERS);
+        let perturbation = family.perturbation(&parameters, &GaussianLaw, budget(6.0));
+        let mut random = ChaCha8Rng::seed_from_u64(7);
+        let n = 400_000;
+        let draws: Vec<_> = (0..n).map(|_| perturbation.sample(&mut random)).collect();
+        let weight = perturbation.weight();
+        assert!(weight > 0.05 && weight < 1.0, "the budget should bind: {weight}");
+        let mut expected_mean = Vector2::zeros();
+        let mut expected = Matrix2::identity() * (1.0 - weight);
+        for (share, bump) in perturbation.bumps() {
+            let m = bump.mean();
+            expected_mean += m * (weight * share);
+            expected += (bump.covariance() + m * m.transpose()) * (weight * share);
+        }
+        let mean = draws.iter().sum::<Vector2<f64>>() / f64::from(n);
+        assert!((mean - expected_mean).norm() < 0.01, "{mean} against {expected_mean}");
+        let second: Matrix2<f64> =
+            draws.iter().map(|d| d * d.transpose()).sum::<Matrix2<f64>>() / f64::from(n);
+        assert!((second - expected).norm() < 0.02, "{second} against {expected}");
+        // Importance weights undo the perturbation: E_Q[1/delta] = 1.
+        let back: f64 = draws.iter().map(|&d| 1.0 / perturbation.likelihood_ratio(d)).sum();
+        assert!((back / f64::from(n) - 1.0).abs() < 0.01);
+    }
 }
 
 #[test]
@@ -268,7 +308,8 @@ fn a_small_ratio_raises_the_budget() {
 #[test]
 fn a_ratio_that_rounds_to_zero_leaves_a_finite_budget() {
     // c and K at their bounds along x, and budget enough for the bump alone.
-    let perturbation = FAMILY.perturbation(&[1e6, 0.0, 1e6, 0.0, 0.0], &GaussianLaw, budget(1e6));
+    let perturbation =
+        family(1).perturbation(&[1e6, 0.0, 1e6, 0.0, 0.0], &GaussianLaw, budget(1e6));
     assert_eq!(perturbation.weight(), 1.0);
     let ratio = perturbation.likelihood_ratio(Vector2::new(-3.0, 0.0));
     assert!(ratio > 0.0 && ratio < 1e-300, "{ratio}");

@@ -28,7 +28,10 @@ pub struct FinitePerturbation {
 impl Family for FiniteFamily {
     type Law = FiniteLaw;
     type Perturbation = FinitePerturbation;
-    const PARAMETERS: usize = MOVES;
+
+    fn parameters(&self) -> usize {
+        MOVES
+    }
 
     fn perturbation(
         &self,

@@ -1,81 +1,57 @@
-//! The Gaussian family (point mass): a bump of likelihood ratio in noise space.
+//! The Gaussian family (point mass): a weighted sum of bumps of likelihood ratio in noise space.
 //!
-//! `delta^0(xi) = (1/Z) exp(-1/2 (xi-c)' K (xi-c))` with K symmetric positive semidefinite. Under
-//! xi ~ N(0, I), with S = (I+K)^{-1}:
-//!
-//! - `log M = -log Z = 1/2 log|I+K| + 1/2 c' K S c`, attained at xi = c,
-//! - the reweighted law is N(m, S) with m = S K c.
-//!
-//! After identity mixing the perturbed law is `lambda N(0, I) + (1 - lambda) N(m, S)`. A pure shift
-//! of the mean would have an unbounded ratio and break every finite budget: that is why the bump
-//! must narrow as it moves.
-//!
-//! | symbol | identifier |
-//! |---|---|
-//! | c, in standard deviations of the noise | `center` |
-//! | K = L L' | `curvature`, `factor` |
-//! | S | `covariance` |
-//! | m | `mean` |
+//! `delta^0 = sum_j w_j delta^0_j` with [`Bump`]s delta^0_j and weights w = softmax(logits). One bump
+//! can shift the noise; two can at once shift it a little and raise the odds of a rare gust. Then
+//! `sup delta^0 <= M = sum_j w_j M_j`, with equality for one bump, and identity mixing by this M keeps
+//! the budget. The perturbed law is the mixture of N(0, I), with weight lambda, and N(m_j, S_j), with
+//! weights (1 - lambda) w_j.
 
 use crate::game::budget::{Budget, Mixing};
+use crate::game::bump::{self, Bump};
 use crate::game::perturbation::{Family, Perturbation};
 use lava_envs::GaussianLaw;
-use nalgebra::{Matrix2, SVector, Vector2};
+use nalgebra::Vector2;
 use rand::{Rng, RngExt};
 use rand_distr::StandardNormal;
 
-/// The Gaussian family. Five parameters: two that are squashed into the disc |c| < `center_bound`,
-/// and three that are squashed into a ball of Cholesky factors L with
-/// `||K|| <= ||L||_F^2 < curvature_bound`.
+/// The most bumps of a family.
+pub const MAX_BUMPS: usize = 3;
+
+/// What zero parameters mean on the diagonal of each bump's L, before squashing: a mild round bump
+/// first, then narrower ones.
+const NEUTRAL_DIAGONAL: [f64; MAX_BUMPS] = [0.1, 0.3, 0.6];
+
+/// The Gaussian family. Its parameters are those of each bump and then, of several bumps, the logits
+/// of their weights.
 #[derive(Debug, Clone, Copy)]
 pub struct GaussianFamily {
+    /// Number of bumps, 1 to [`MAX_BUMPS`].
+    pub bumps: usize,
     /// Bound of |c|.
     pub center_bound: f64,
     /// Bound of the eigenvalues of K.
     pub curvature_bound: f64,
 }
 
-/// K = L L' has no gradient at L = 0; parameters of zero mean this diagonal before squashing, a
-/// mild round bump.
-const NEUTRAL_DIAGONAL: f64 = 0.1;
-
 /// An admissible perturbation of the standard normal law.
 #[derive(Debug, Clone)]
 pub struct GaussianPerturbation {
-    center: Squashed<2>,
-    /// Entries (L11, L21, L22) of the Cholesky factor.
-    factor: Squashed<3>,
-    curvature: Matrix2<f64>,
-    covariance: Matrix2<f64>,
-    log_supremum: f64,
+    /// The bumps; those behind `count` have weight 0.
+    bumps: [Bump; MAX_BUMPS],
+    weights: [f64; MAX_BUMPS],
+    count: usize,
+    /// M.
+    supremum: f64,
     mixing: Mixing,
-}
-
-/// `y = bound * v / sqrt(1 + |v|^2)`: all of R^N onto the open ball of radius `bound`.
-#[derive(Debug, Clone, Copy)]
-struct Squashed<const N: usize> {
-    value: SVector<f64, N>,
-    bound: f64,
-    scale: f64,
-}
-
-impl<const N: usize> Squashed<N> {
-    fn new(raw: SVector<f64, N>, bound: f64) -> Self {
-        let scale = 1.0 / (1.0 + raw.norm_squared()).sqrt();
-        Squashed { value: raw * (bound * scale), bound, scale }
-    }
-
-    /// Gradient by v, from the gradient by y: (bound/r) (I - u u') g with u = v/r, r^2 = 1 + |v|^2.
-    fn pull_back(&self, gradient: SVector<f64, N>) -> SVector<f64, N> {
-        let unit = self.value / self.bound;
-        (gradient - unit * unit.dot(&gradient)) * (self.bound * self.scale)
-    }
 }
 
 impl Family for GaussianFamily {
     type Law = GaussianLaw;
     type Perturbation = GaussianPerturbation;
-    const PARAMETERS: usize = 5;
+
+    fn parameters(&self) -> usize {
+        bump::PARAMETERS * self.bumps + if self.bumps > 1 { self.bumps } else { 0 }
+    }
 
     fn perturbation(
         &self,
@@ -83,91 +59,78 @@ impl Family for GaussianFamily {
         _law: &GaussianLaw,
         budget: Budget,
     ) -> GaussianPerturbation {
-        let [x, y, a, b, d] = std::array::from_fn(|i| parameters[i]);
-        let center = Squashed::new(Vector2::new(x, y), self.center_bound);
-        let factor = Squashed::new(
-            SVector::<f64, 3>::new(NEUTRAL_DIAGONAL + a, b, NEUTRAL_DIAGONAL + d),
-            self.curvature_bound.sqrt(),
-        );
-        GaussianPerturbation::new(center, factor, budget)
+        let count = self.bumps;
+        let bump = |j: usize| {
+            let own = &parameters[bump::PARAMETERS * j..][..bump::PARAMETERS];
+            Bump::new(own, NEUTRAL_DIAGONAL[j], self.center_bound, self.curvature_bound)
+        };
+        let mut bumps = [bump(0); MAX_BUMPS];
+        let mut weights = [1.0, 0.0, 0.0];
+        if count > 1 {
+            let logits = &parameters[bump::PARAMETERS * count..][..count];
+            let highest = logits.iter().copied().fold(f64::NEG_INFINITY, f64::max);
+            for (j, logit) in logits.iter().enumerate() {
+                bumps[j] = bump(j);
+                weights[j] = (logit - highest).exp();
+            }
+            let sum: f64 = weights[..count].iter().sum();
+            weights[..count].iter_mut().for_each(|weight| *weight /= sum);
+        }
+        let log_supremum = if count == 1 {
+            bumps[0].log_supremum()
+        } else {
+            (0..count).map(|j| weights[j] * bumps[j].log_supremum().exp()).sum::<f64>().ln()
+        };
+        let mixing = budget.mix(log_supremum);
+        GaussianPerturbation { bumps, weights, count, supremum: log_supremum.exp(), mixing }
     }
 }
 
 impl GaussianPerturbation {
-    fn new(center: Squashed<2>, factor: Squashed<3>, budget: Budget) -> Self {
-        let lower = lower_triangle(&factor.value);
-        let curvature = lower * lower.transpose();
-        // The inverse of I + K in closed form; its determinant is at least 1.
-        let (k11, k12, k22) = (curvature.m11, curvature.m12, curvature.m22);
-        let determinant = (1.0 + k11) * (1.0 + k22) - k12 * k12;
-        let covariance = Matrix2::new(1.0 + k22, -k12, -k12, 1.0 + k11) / determinant;
-        let c = center.value;
-        let log_supremum = 0.5 * determinant.ln() + 0.5 * c.dot(&(curvature * (covariance * c)));
-        let mixing = budget.mix(log_supremum);
-        GaussianPerturbation { center, factor, curvature, covariance, log_supremum, mixing }
+    /// The bumps with their weights w_j.
+    pub fn bumps(&self) -> impl Iterator<Item = (f64, &Bump)> {
+        self.weights[..self.count].iter().copied().zip(&self.bumps)
     }
 
-    /// The centre c of the bump.
-    pub fn center(&self) -> Vector2<f64> {
-        self.center.value
+    /// M, the bound of sup delta^0.
+    pub fn base_supremum(&self) -> f64 {
+        self.supremum
     }
 
-    /// The curvature K of the bump.
-    pub fn curvature(&self) -> Matrix2<f64> {
-        self.curvature
-    }
-
-    /// The mean m = S K c of the reweighted law before mixing.
-    pub fn mean(&self) -> Vector2<f64> {
-        self.covariance * (self.curvature * self.center.value)
-    }
-
-    /// The covariance S of the reweighted law before mixing.
-    pub fn covariance(&self) -> Matrix2<f64> {
-        self.covariance
-    }
-
-    /// log M.
-    pub fn log_supremum(&self) -> f64 {
-        self.log_supremum
-    }
-
-    /// 1 - lambda, the share of the reweighted law in the mixture.
+    /// 1 - lambda, the share of the bumps in the mixture.
     pub fn weight(&self) -> f64 {
         self.mixing.weight
     }
 
-    /// delta^0(xi) = M exp(-1/2 (xi-c)' K (xi-c)).
+    /// delta^0(xi).
     fn base(&self, xi: Vector2<f64>) -> f64 {
-        let off = xi - self.center.value;
-        (self.log_supremum - 0.5 * off.dot(&(self.curvature * off))).exp()
+        self.bumps().map(|(weight, bump)| weight * bump.likelihood_ratio(xi)).sum()
     }
 
-    /// Gradients of log M by c, which is c - S c (as K S = I - S), and by K, which is
-    /// 1/2 (S + S c c' S).
-    fn log_supremum_gradient(&self) -> (Vector2<f64>, Matrix2<f64>) {
-        let c = self.center.value;
-        let shrunk = self.covariance * c;
-        (c - shrunk, (self.covariance + shrunk * shrunk.transpose()) * 0.5)
+    /// Writes the gradient by the parameters of a sum over the bumps j, given how it depends on
+    /// (log w_j with log delta^0_j(xi), log w_j with log M_j, log|I+K_j|, w_j alone).
+    fn pull_back(
+        &self,
+        xi: Vector2<f64>,
+        gradient: &mut [f64],
+        by: impl Fn(f64, &Bump) -> [f64; 4],
+    ) {
+        let mut by_logarithm = [0.0; MAX_BUMPS];
+        for (j, (weight, bump)) in self.bumps().enumerate() {
+            let [by_ratio, by_supremum, by_determinant, by_weight] = by(weight, bump);
+            let own = &mut gradient[bump::PARAMETERS * j..][..bump::PARAMETERS];
+            bump.pull_back(xi, by_ratio, by_supremum, by_determinant, own);
+            by_logarithm[j] = by_ratio + by_supremum + by_weight * weight;
+        }
+        if self.count > 1 {
+            // dlog w_j / d logit_k = [j = k] - w_k.
+            let sum: f64 = by_logarithm.iter().sum();
+            let logits = &mut gradient[bump::PARAMETERS * self.count..][..self.count];
+            for (k, logit) in logits.iter_mut().enumerate() {
+                *logit = by_logarithm[k] - self.weights[k] * sum;
+            }
+        }
     }
-
-    /// Gradient by the parameters, from gradients by c and by K (all four entries free).
-    fn pull_back(&self, by_center: Vector2<f64>, by_curvature: Matrix2<f64>, gradient: &mut [f64]) {
-        // K = L L': dF/dL = 2 (dF/dK) L for a symmetric dF/dK.
-        let by_factor = by_curvature * lower_triangle(&self.factor.value) * 2.0;
-        let center = self.center.pull_back(by_center);
-        let factor = self.factor.pull_back(SVector::<f64, 3>::new(
-            by_factor.m11,
-            by_factor.m21,
-            by_factor.m22,
-        ));
-        gradient[..2].copy_from_slice(center.as_slice());
-        gradient[2..].copy_from_slice(factor.as_slice());
-    }
-}
-
-fn lower_triangle(entries: &SVector<f64, 3>) -> Matrix2<f64> {
-    Matrix2::new(entries[0], 0.0, entries[1], entries[2])
 }
 
 impl Perturbation for GaussianPerturbation {
@@ -178,67 +141,54 @@ impl Perturbation for GaussianPerturbation {
     }
 
     fn supremum(&self) -> f64 {
-        self.mixing.likelihood_ratio(self.log_supremum.exp())
+        self.mixing.likelihood_ratio(self.supremum)
     }
 
-    /// A draw from the mixture lambda N(0, I) + (1 - lambda) N(m, S).
+    /// A draw from the mixture of N(0, I) and the N(m_j, S_j).
     fn sample<R: Rng>(&self, random: &mut R) -> Vector2<f64> {
-        let bump = random.random::<f64>() < self.mixing.weight;
+        let mut level = random.random::<f64>();
         let z = Vector2::new(random.sample(StandardNormal), random.sample(StandardNormal));
-        if bump { self.mean() + square_root(&self.covariance) * z } else { z }
+        for (weight, bump) in self.bumps() {
+            level -= self.mixing.weight * weight;
+            if level < 0.0 {
+                return bump.place(z);
+            }
+        }
+        z
     }
 
     fn score(&self, xi: Vector2<f64>, gradient: &mut [f64]) -> f64 {
         let base = self.base(xi);
-        let (by_base, by_supremum) = self.mixing.derivatives(base);
         let ratio = self.mixing.likelihood_ratio(base);
-        let (supremum_center, supremum_curvature) = self.log_supremum_gradient();
-        let off = xi - self.center.value;
-        // log delta^0 = log M - 1/2 (xi-c)' K (xi-c), so log M enters on both ways.
-        let through_supremum = (by_base + by_supremum) / ratio;
-        let direct = by_base / ratio;
-        self.pull_back(
-            supremum_center * through_supremum + self.curvature * off * direct,
-            supremum_curvature * through_supremum - off * off.transpose() * (0.5 * direct),
-            gradient,
-        );
+        // delta = 1 + rho (delta^0 - 1), and rho depends on log M.
+        let (_, by_supremum) = self.mixing.derivatives(base);
+        self.pull_back(xi, gradient, |weight, bump| {
+            let by_ratio = self.mixing.weight * weight * bump.likelihood_ratio(xi) / ratio;
+            let share = weight * bump.log_supremum().exp() / self.supremum;
+            [by_ratio, by_supremum * share / ratio, 0.0, 0.0]
+        });
         ratio
     }
 
     /// The entropy of a mixture has no closed form. By concavity it is at least
-    /// `lambda H(N(0,I)) + (1-lambda) H(N(m,S)) = 1 + log 2 pi - (1-lambda)/2 log|I+K|`, which is
-    /// the bonus.
+    /// `lambda H(N(0,I)) + (1-lambda) sum_j w_j H(N(m_j,S_j))
+    /// = 1 + log 2 pi - (1-lambda)/2 sum_j w_j log|I+K_j|`, which is the bonus.
     fn entropy(&self, gradient: &mut [f64]) -> f64 {
-        let log_determinant = -self.covariance.determinant().ln(); // log|I+K|
-        let (supremum_center, supremum_curvature) = self.log_supremum_gradient();
-        let by_supremum = -0.5 * log_determinant * self.mixing.by_log_supremum;
-        self.pull_back(
-            supremum_center * by_supremum,
-            // d log|I+K| / dK = S
-            supremum_curvature * by_supremum - self.covariance * (0.5 * self.mixing.weight),
-            gradient,
-        );
-        1.0 + (2.0 * std::f64::consts::PI).ln() - 0.5 * self.mixing.weight * log_determinant
+        let lost: f64 = self.bumps().map(|(weight, bump)| weight * bump.log_determinant()).sum();
+        let by_supremum = -0.5 * lost * self.mixing.by_log_supremum;
+        self.pull_back(Vector2::zeros(), gradient, |weight, bump| {
+            let share = weight * bump.log_supremum().exp() / self.supremum;
+            let by_weight = -0.5 * self.mixing.weight * bump.log_determinant();
+            [0.0, by_supremum * share, -0.5 * self.mixing.weight * weight, by_weight]
+        });
+        1.0 + (2.0 * std::f64::consts::PI).ln() - 0.5 * self.mixing.weight * lost
     }
 
-    /// The integral of P delta^0 over the plane is `M |I+K|^{-1/2} exp(-1/2 c' K S c)`, evaluated
-    /// with a decomposition of K of its own.
+    /// From the integrals of the bumps, each evaluated with a decomposition of K of its own.
     fn normalisation_error(&self) -> f64 {
-        let eigen = self.curvature.symmetric_eigen();
-        let along = eigen.eigenvectors.transpose() * self.center.value;
-        let log_z: f64 = (0..2)
-            .map(|i| {
-                let k = eigen.eigenvalues[i];
-                -0.5 * k.ln_1p() - 0.5 * along[i] * along[i] * k / (1.0 + k)
-            })
-            .sum();
-        self.mixing.weight * (self.log_supremum + log_z).exp_m1().abs()
+        let off = |(weight, bump): (f64, &Bump)| {
+            weight * (bump.log_supremum() + bump.log_integral()).exp_m1()
+        };
+        self.mixing.weight * self.bumps().map(off).sum::<f64>().abs()
     }
-}
-
-/// The lower triangular A with A A' = S, of a positive definite S.
-fn square_root(covariance: &Matrix2<f64>) -> Matrix2<f64> {
-    let a = covariance.m11.sqrt();
-    let b = covariance.m21 / a;
-    Matrix2::new(a, 0.0, b, (covariance.m22 - b * b).sqrt())
 }

@@ -1,6 +1,7 @@
 //! The game on plain floats: budget, perturbations of chance, and the law of the return.
 
 pub mod budget;
+pub mod bump;
 pub mod finite;
 pub mod gaussian;
 pub mod perturbation;

@@ -18,7 +18,7 @@ pub trait Family: Clone + std::fmt::Debug {
     type Perturbation: Perturbation<Law = Self::Law>;
 
     /// Number of parameters.
-    const PARAMETERS: usize;
+    fn parameters(&self) -> usize;
 
     /// The perturbation of `law` with these parameters (any real numbers), made admissible within
     /// `budget` by identity mixing.

@@ -51,6 +51,7 @@ impl Arena for LavaPoint {
 
     fn family(options: &TrainOptions) -> GaussianFamily {
         GaussianFamily {
+            bumps: options.bump.count,
             center_bound: options.bump.center,
             curvature_bound: options.bump.curvature,
         }

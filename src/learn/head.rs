@@ -6,6 +6,8 @@
 //! of chance and its action IS the realised outcome, so its head wraps a family of perturbations.
 
 use cvar_game::game::budget::Budget;
+use cvar_game::game::bump;
+use cvar_game::game::gaussian::MAX_BUMPS;
 use cvar_game::game::perturbation::{Family, Perturbation};
 use lava_envs::law::{Law, MOVES, sample_index};
 use lava_envs::{Force, Move};
@@ -13,8 +15,8 @@ use nalgebra::Vector2;
 use rand::{Rng, RngExt};
 use rand_distr::StandardNormal;
 
-/// The most parameters that a head takes.
-pub const MAX_PARAMETERS: usize = 8;
+/// The most parameters that a head takes: those of a sum of bumps with their weights.
+pub const MAX_PARAMETERS: usize = (bump::PARAMETERS + 1) * MAX_BUMPS;
 
 /// The law of a player's choice, given the outputs of its actor.
 ///
@@ -203,7 +205,7 @@ impl<F: Family> Head for AntagonistHead<F> {
     type Choice = <F::Law as Law>::Outcome;
 
     fn outputs(&self) -> usize {
-        F::PARAMETERS
+        self.0.parameters()
     }
 
     fn log_probability(

@@ -5,6 +5,7 @@
 //! |---|---|
 //! | the alternating loop | [`train`] |
 //! | PPO and its loss | [`ppo`] |
+//! | The price of budget in the antagonist's gradient | [`price`] |
 //! | what a network's outputs mean | [`head`] |
 //! | one step of the game | [`contest`] |
 //! | what a player sees | [`pair`] |
@@ -26,6 +27,7 @@ pub mod network;
 pub mod pair;
 pub mod play;
 pub mod ppo;
+pub mod price;
 pub mod protocol;
 pub mod rollout;
 pub mod train;

@@ -103,6 +103,14 @@ impl Views {
         close(world, slot, &mut row[W::OBSERVATION..]);
     }
 
+    /// Turns rows of the antagonist into those that it would see with exp(`log_factor`) times the
+    /// budget.
+    pub fn enrich<W: World>(&self, rows: &mut [f32], log_factor: f64) {
+        for row in rows.chunks_exact_mut(self.antagonist_inputs::<W>() + 1) {
+            row[W::SITUATION] += (log_factor * self.budget_scale) as f32;
+        }
+    }
+
     /// Writes the antagonist's row, shape `[antagonist_inputs + 1]`.
     pub fn antagonist<W: World>(
         &self,

@@ -15,6 +15,7 @@ use crate::checkpoint::{PlayerState, Unfit};
 use crate::gae;
 use crate::head::{Head, MAX_PARAMETERS};
 use crate::network::{Network, Outputs, Shape};
+use crate::price::Spending;
 use crate::trajectories::Trajectories;
 use cvar_game::options::PlayerOptions;
 use lava_envs::random::ChaCha8Rng;
@@ -198,10 +199,12 @@ impl<H: Head> Player<H> {
         parameters
     }
 
-    /// One update on the trajectories of a rollout: epochs of minibatches in random order.
+    /// One update on the trajectories of a rollout: epochs of minibatches in random order. The
+    /// advantages are charged for what was spent, where that is given.
     pub fn update(
         &mut self,
         trajectories: &Trajectories<H>,
+        spending: Option<&Spending>,
         gamma: f64,
         options: &PlayerOptions,
         rates: Rates,
@@ -227,6 +230,12 @@ impl<H: Head> Player<H> {
             advantage: advantages[i],
             target: advantages[i] + values[i],
         }));
+        if let Some(spending) = spending {
+            spending.charge(advantages, &trajectories.ended, gamma);
+            for (sample, &advantage) in samples.iter_mut().zip(&*advantages) {
+                sample.advantage = advantage;
+            }
+        }
 
         let row = self.network.shape().width();
         order.clear();

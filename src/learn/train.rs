@@ -5,6 +5,7 @@ use crate::checkpoint::{TrainingState, Unfit};
 use crate::contest::Choosing;
 use crate::pair::Pair;
 use crate::ppo::{Losses, Player, Rates};
+use crate::price::Spending;
 use crate::rollout::Collector;
 use cvar_game::game::budget::Eta;
 use cvar_game::options::{PlayerOptions, Role, TrainOptions};
@@ -126,15 +127,23 @@ impl<'a, W: Arena> Training<'a, W> {
         collector.collect(pair, turn.budget, turn.choosing, options);
         let rates = turn.rates;
         let losses = match (turn.role, &mut pair.antagonist) {
-            (Role::Antagonist, Some(antagonist)) => antagonist.update(
-                &collector.antagonist,
-                gamma,
-                &options.antagonist,
-                rates,
-                minibatches,
-            ),
+            (Role::Antagonist, Some(antagonist)) => {
+                let trajectories = &collector.antagonist;
+                let spending = options
+                    .price_budget
+                    .then(|| Spending::of::<W>(antagonist, trajectories, &pair.views));
+                antagonist.update(
+                    trajectories,
+                    spending.as_ref(),
+                    gamma,
+                    &options.antagonist,
+                    rates,
+                    minibatches,
+                )
+            }
             _ => pair.protagonist.update(
                 &collector.protagonist,
+                None,
                 gamma,
                 &options.protagonist,
                 rates,

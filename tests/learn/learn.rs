@@ -3,8 +3,8 @@
 
 use cvar_game::game::budget::{Budget, Eta};
 use cvar_game::game::finite::FiniteFamily;
-use cvar_game::game::gaussian::GaussianFamily;
-use cvar_game::options::{BumpBounds, Credit, PlayerOptions, Role, TrainOptions};
+use cvar_game::game::gaussian::{GaussianFamily, MAX_BUMPS};
+use cvar_game::options::{BumpOptions, Credit, PlayerOptions, Role, TrainOptions};
 use cvar_learn::adam::Adam;
 use cvar_learn::arena::Arena;
 use cvar_learn::checkpoint::TrainingState;
@@ -54,10 +54,11 @@ fn options() -> TrainOptions {
         budget_rise: 0.0,
         response: 0.0,
         hide_budget: false,
+        price_budget: true,
         protagonist: player(),
         initial_std: 1.0,
         antagonist: player(),
-        bump: BumpBounds { center: 4.0, curvature: 50.0 },
+        bump: BumpOptions { count: 2, center: 4.0, curvature: 50.0 },
     }
 }
 
@@ -165,12 +166,16 @@ fn the_loss_gradient_equals_finite_differences_for_every_head() {
     });
     check_loss_gradient(&finite, &drawn, &[], 3);
 
-    let bump = AntagonistHead(GaussianFamily { center_bound: 4.0, curvature_bound: 50.0 });
-    let drawn = samples(&bump, 12, &[], |r| {
-        let budget = Budget::start(eta(r.random_range(1.0..30.0)));
-        ((GaussianLaw, budget), Vector2::new(r.random_range(-2.0..2.0), r.random_range(-2.0..2.0)))
-    });
-    check_loss_gradient(&bump, &drawn, &[], 4);
+    for bumps in 1..=MAX_BUMPS {
+        let family = GaussianFamily { bumps, center_bound: 4.0, curvature_bound: 50.0 };
+        let sum = AntagonistHead(family);
+        let drawn = samples(&sum, 12, &[], |r| {
+            let budget = Budget::start(eta(r.random_range(1.0..30.0)));
+            let xi = Vector2::new(r.random_range(-2.0..2.0), r.random_range(-2.0..2.0));
+            ((GaussianLaw, budget), xi)
+        });
+        check_loss_gradient(&sum, &drawn, &[], 4);
+    }
 }
 
 /// The written-out gradients of the networks, ours and libtorch's products, against autograd, for a loss

@@ -22,6 +22,7 @@ use cvar_learn::arena::Arena;
 use cvar_learn::contest::Choosing;
 use cvar_learn::pair::Pair;
 use cvar_learn::ppo::Rates;
+use cvar_learn::price::Spending;
 use cvar_learn::rollout::Collector;
 use cvar_learn::train::{Game, train};
 use lava_envs::random::{ChaCha8Rng, Purpose, stream};
@@ -93,7 +94,7 @@ fn perturbations_of<F: Family>(criterion: &mut Criterion, name: &str, family: &F
     let cases: Vec<_> = (0..PERTURBATIONS)
         .map(|_| {
             let parameters: Vec<f64> =
-                (0..F::PARAMETERS).map(|_| random.sample(StandardNormal)).collect();
+                (0..family.parameters()).map(|_| random.sample(StandardNormal)).collect();
             (parameters, law.sample(random))
         })
         .collect();
@@ -105,8 +106,8 @@ fn perturbations_of<F: Family>(criterion: &mut Criterion, name: &str, family: &F
         });
     });
     group.bench_function(BenchmarkId::new(name, "learn"), |bencher| {
-        let mut score = vec![0.0; F::PARAMETERS];
-        let mut entropy_gradient = vec![0.0; F::PARAMETERS];
+        let mut score = vec![0.0; family.parameters()];
+        let mut entropy_gradient = vec![0.0; family.parameters()];
         bencher.iter(|| {
             for (parameters, outcome) in &cases {
                 let perturbation = family.perturbation(black_box(parameters), &law, budget);
@@ -154,13 +155,19 @@ fn update<W: Bench>(criterion: &mut Criterion) {
     let player = &mut pair.protagonist;
     let its = &options.protagonist;
     group.bench_function(BenchmarkId::new(W::NAME.to_string(), "protagonist"), |bencher| {
-        bencher
-            .iter(|| player.update(&collector.protagonist, 1.0, its, rates(its.entropy), random));
+        bencher.iter(|| {
+            player.update(&collector.protagonist, None, 1.0, its, rates(its.entropy), random)
+        });
     });
     let player = pair.antagonist.as_mut().expect("eta is above 1");
     let its = &options.antagonist;
     group.bench_function(BenchmarkId::new(W::NAME.to_string(), "antagonist"), |bencher| {
-        bencher.iter(|| player.update(&collector.antagonist, 1.0, its, rates(its.entropy), random));
+        bencher.iter(|| {
+            let played = &collector.antagonist;
+            let spending =
+                options.price_budget.then(|| Spending::of::<W>(player, played, &pair.views));
+            player.update(played, spending.as_ref(), 1.0, its, rates(its.entropy), random)
+        });
     });
     group.finish();
 }
