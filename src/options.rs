@@ -29,6 +29,8 @@ pub struct TrainOptions {
     /// Share of the run at its end in which the antagonist alone is updated, against the greedy
     /// protagonist: a best response to the final policy.
     pub response: f64,
+    /// Who reweights chance.
+    pub adversary: Adversary,
     /// Hides the remaining budget from the antagonist (an ablation).
     pub hide_budget: bool,
     /// Whether the antagonist's gradient counts what it spends (see `cvar_learn::price`).
@@ -87,6 +89,17 @@ pub enum Credit {
     Chosen,
     /// The move that was executed: the published code's behaviour, on the grid alone.
     Executed,
+}
+
+/// Who reweights chance.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Adversary {
+    /// The antagonist that learns.
+    Learned,
+    /// One without memory that draws the parameters of each step's perturbation from N(0, 1)
+    /// (an ablation).
+    Random,
 }
 
 /// Options of one PPO player.

@@ -9,8 +9,11 @@ use crate::head::Policy;
 use crate::pair::{Pair, Protagonist, Views};
 use cvar_game::game::budget::{Budget, Eta};
 use cvar_game::game::perturbation::{Family, Perturbation};
+use cvar_game::options::Adversary;
 use lava_envs::random::ChaCha8Rng;
 use lava_envs::{Law, Step};
+use rand::RngExt;
+use rand_distr::StandardNormal;
 
 /// What chance decides in a world.
 pub type Outcome<W> = <<W as lava_envs::World>::Law as Law>::Outcome;
@@ -185,7 +188,12 @@ impl<W: Arena> Contest<W> {
             let (outcome, ratio) = match (chance, learned) {
                 (Chance::Opponent(opponent), _) => opponent.draw(&self.world, slot, &law, random),
                 (_, Some(antagonist)) => {
-                    let parameters = antagonist.parameters_in(&self.antagonist_outputs, slot);
+                    let parameters = match pair.adversary {
+                        Adversary::Learned => {
+                            antagonist.parameters_in(&self.antagonist_outputs, slot)
+                        }
+                        Adversary::Random => std::array::from_fn(|_| random.sample(StandardNormal)),
+                    };
                     let perturbation = antagonist.head.0.perturbation(&parameters, &law, budget);
                     if self.audit {
                         let error = perturbation.normalisation_error();

@@ -4,7 +4,7 @@ use crate::arena::Arena;
 use crate::head::AntagonistHead;
 use crate::ppo::Player;
 use cvar_game::game::budget::{Budget, Eta};
-use cvar_game::options::{Role, TrainOptions};
+use cvar_game::options::{Adversary, Role, TrainOptions};
 use lava_envs::World;
 use lava_envs::random::{Purpose, stream};
 use tch::Device;
@@ -23,6 +23,8 @@ pub struct Pair<W: Arena> {
     pub antagonist: Option<Antagonist<W>>,
     /// What they see.
     pub views: Views,
+    /// Whether the antagonist plays what its network says, or at random.
+    pub adversary: Adversary,
 }
 
 impl<W: Arena> Pair<W> {
@@ -45,7 +47,7 @@ impl<W: Arena> Pair<W> {
                 &mut stream(seed, Purpose::AntagonistWeights, 0),
             )
         });
-        Pair { protagonist, antagonist, views }
+        Pair { protagonist, antagonist, views, adversary: options.adversary }
     }
 
     /// Parameters of a player; empty for an absent one.

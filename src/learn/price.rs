@@ -196,7 +196,8 @@ mod tests {
                 off.fold(0.0, f64::max)
             };
             assert!(distance(true) < 1e-5, "eta = {budget}, gamma = {gamma}: {}", distance(true));
-            assert!(distance(false) > 1e-3, "eta = {budget}: {}", distance(false));
+            // With budget to spare its price is next to nothing.
+            assert!(budget > 10.0 || distance(false) > 1e-3, "eta = {budget}: {}", distance(false));
         }
     }
 }

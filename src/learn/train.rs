@@ -8,7 +8,7 @@ use crate::ppo::{Losses, Player, Rates};
 use crate::price::Spending;
 use crate::rollout::Collector;
 use cvar_game::game::budget::Eta;
-use cvar_game::options::{PlayerOptions, Role, TrainOptions};
+use cvar_game::options::{Adversary, PlayerOptions, Role, TrainOptions};
 use lava_envs::End;
 use lava_envs::random::{ChaCha8Rng, Purpose, position, stream, stream_from};
 use tch::Device;
@@ -224,8 +224,8 @@ pub struct Turn {
     pub rates: Rates,
 }
 
-/// All turns of a run: K of the follower, one of the leader, and so on. While the budget is 1 every
-/// turn is the protagonist's; at the end those of the response to its greedy policy are the
+/// All turns of a run: K of the follower, one of the leader, and so on. While the budget is 1, or the
+/// adversary does not learn, every turn is the protagonist's; at the end those of the response to its greedy policy are the
 /// antagonist's. Each player's rates fall linearly over its own turns.
 pub fn schedule(options: &TrainOptions, eta: Eta) -> Vec<Turn> {
     let updates = options.steps.div_ceil(options.rollout());
@@ -235,7 +235,7 @@ pub fn schedule(options: &TrainOptions, eta: Eta) -> Vec<Turn> {
     let roles: Vec<(Role, Eta)> = (0..updates)
         .map(|update| {
             let budget = budget_at(options, eta, update as f64 / updates as f64);
-            if budget.is_neutral() {
+            if budget.is_neutral() || options.adversary == Adversary::Random {
                 return (Role::Protagonist, budget);
             }
             if responds(update) {
@@ -261,7 +261,7 @@ pub fn schedule(options: &TrainOptions, eta: Eta) -> Vec<Turn> {
             learning_rate: between(player.learning_rate, player.learning_rate_final),
             entropy: between(player.entropy, player.entropy_final),
         };
-        let response = !budget.is_neutral() && responds(update as u64);
+        let response = role == Role::Antagonist && responds(update as u64);
         let choosing = if response { Choosing::Greedy } else { Choosing::Sampled };
         Turn { update: update as u64 + 1, role, budget, choosing, rates }
     };

@@ -4,7 +4,7 @@
 use cvar_game::game::budget::{Budget, Eta};
 use cvar_game::game::finite::FiniteFamily;
 use cvar_game::game::gaussian::{GaussianFamily, MAX_BUMPS};
-use cvar_game::options::{BumpOptions, Credit, PlayerOptions, Role, TrainOptions};
+use cvar_game::options::{Adversary, BumpOptions, Credit, PlayerOptions, Role, TrainOptions};
 use cvar_learn::adam::Adam;
 use cvar_learn::arena::Arena;
 use cvar_learn::checkpoint::TrainingState;
@@ -53,6 +53,7 @@ fn options() -> TrainOptions {
         budget_wait: 0.0,
         budget_rise: 0.0,
         response: 0.0,
+        adversary: Adversary::Learned,
         hide_budget: false,
         price_budget: true,
         protagonist: player(),
@@ -285,8 +286,8 @@ fn no_antagonist_breaks_the_budget_at_the_point_mass() {
 }
 
 /// Nominal episodes weighted by prod delta against episodes of the antagonist itself.
-fn check_weights<W: Arena>(world: impl Fn() -> W) {
-    let pair = Pair::<W>::new(&options(), eta(3.0), 5, Device::Cpu);
+fn check_weights<W: Arena>(world: impl Fn() -> W, adversary: Adversary) {
+    let pair = Pair::<W>::new(&TrainOptions { adversary, ..options() }, eta(3.0), 5, Device::Cpu);
     let of = |chance| {
         let setting = Play {
             choosing: Choosing::Sampled,
@@ -318,8 +319,10 @@ fn check_weights<W: Arena>(world: impl Fn() -> W) {
 
 #[test]
 fn likelihood_ratios_reproduce_the_antagonist() {
-    check_weights(|| LavaGrid::new(&GridConfig::default(), 250).unwrap());
-    check_weights(|| LavaPoint::new(&PointConfig::default(), 250).unwrap());
+    for adversary in [Adversary::Learned, Adversary::Random] {
+        check_weights(|| LavaGrid::new(&GridConfig::default(), 250).unwrap(), adversary);
+        check_weights(|| LavaPoint::new(&PointConfig::default(), 250).unwrap(), adversary);
+    }
 }
 
 /// At budget 1 the antagonist's episodes are the nominal ones, bit for bit.
@@ -403,6 +406,9 @@ fn turns_follow_algorithm_1() {
     of.leader = Role::Antagonist;
     assert_eq!(roles(&of, 25.0), "PPAPPAPPAPPA");
     of.leader = Role::Protagonist;
+    of.adversary = Adversary::Random;
+    assert_eq!(roles(&of, 25.0), "PPPPPPPPPPPP");
+    of.adversary = Adversary::Learned;
     of.budget_wait = 0.5;
     assert_eq!(roles(&of, 25.0), "PPPPPPAAPAAP");
     let turns = schedule(&of, eta(25.0));

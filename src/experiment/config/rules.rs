@@ -56,6 +56,7 @@ const RULES: &[(&str, Rule)] = &[
     ("train.budget_wait", Number(Included(0.0), Excluded(1.0))),
     ("train.budget_rise", SHARE),
     ("train.response", SHARE),
+    ("train.adversary", Word(&["learned", "random"])),
     ("train.hide_budget", Flag),
     ("train.price_budget", Flag),
     ("train.initial_std", POSITIVE),
