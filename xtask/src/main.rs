@@ -1,10 +1,11 @@
-//! Chores of the workspace: `cargo xtask setup`, `test`, `bench`, `speed`, `scaling`.
+//! Chores of the workspace: `cargo xtask setup`, `test`, `bench`, `ablations`, `speed`, `scaling`.
 //!
 //! Training needs libtorch, a C++ library of 480 MB that cargo cannot fetch. `setup` fetches it
 //! once for all checkouts of one user and links it into this one; after that plain `cargo build`,
 //! `cargo test` and `cargo run` work with no environment variable (`.cargo/config.toml` and
 //! `build.rs` at the root do the rest). The other verbs run `setup` first, then cargo.
 
+mod ablations;
 mod cache;
 mod libtorch;
 mod scaling;
@@ -46,6 +47,11 @@ enum Verb {
         #[arg(trailing_var_arg = true, allow_hyphen_values = true)]
         passed_on: Vec<OsString>,
     },
+    /// Set up, then run what configs/paper.toml is compared with; results go to results/ablations
+    Ablations {
+        /// One of them; without it, all that are not there yet
+        only: Option<String>,
+    },
     /// Set up, then measure what training costs against its sizes; results go to results/speed
     Scaling,
     /// Set up, then measure the speed of training and its parts; the table goes to target/speed.md
@@ -55,6 +61,9 @@ enum Verb {
         passed_on: Vec<OsString>,
     },
 }
+
+/// Builds both programs.
+const BUILD: [&str; 3] = ["build", "--release", "--bins"];
 
 fn main() -> ExitCode {
     match run(Arguments::parse().verb) {
@@ -74,7 +83,7 @@ fn run(verb: Verb) -> Result<ExitCode> {
         Verb::Test { passed_on } => cargo(&repository, &["test", "--workspace"], &passed_on),
         Verb::Bench { passed_on } => {
             // `cargo run` alone would build one of the two programs.
-            let code = cargo(&repository, &["build", "--release", "--bins"], &[])?;
+            let code = cargo(&repository, &BUILD, &[])?;
             if code != ExitCode::SUCCESS {
                 return Ok(code);
             }
@@ -82,8 +91,15 @@ fn run(verb: Verb) -> Result<ExitCode> {
             let run = ["run", "--release", "--bin", "cvar-game"];
             cargo(&repository, &[run, bench].concat(), &passed_on)
         }
+        Verb::Ablations { only } => {
+            let code = cargo(&repository, &BUILD, &[])?;
+            if code != ExitCode::SUCCESS {
+                return Ok(code);
+            }
+            ablations::run(&repository, &speed::target(&repository), only.as_deref())
+        }
         Verb::Scaling => {
-            let code = cargo(&repository, &["build", "--release", "--bins"], &[])?;
+            let code = cargo(&repository, &BUILD, &[])?;
             if code == ExitCode::SUCCESS {
                 scaling::measure(&repository, &speed::target(&repository))?;
             }
