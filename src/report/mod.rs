@@ -173,9 +173,10 @@ fn persist_figures(dir: &Path, figures: &Figures) -> Result<(), ReportError> {
     std::fs::create_dir_all(&folder)
         .map_err(|source| ReportError::Write { path: folder.clone(), source })?;
     for figure in &figures.drawn {
-        let stem = folder.join(&figure.name);
-        persist(&stem.with_extension("svg"), figure.svg.as_bytes())?;
-        let path = stem.with_extension("png");
+        // The name of a world may have a dot.
+        let file = |ending| folder.join(format!("{}.{ending}", figure.name));
+        persist(&file("svg"), figure.svg.as_bytes())?;
+        let path = file("png");
         let png = figures::png(&figure.svg).map_err(|what| ReportError::Write {
             path: path.clone(),
             source: std::io::Error::other(what),
