@@ -2,9 +2,9 @@
 
 use super::ReportError;
 use super::runs::{Run, read_json};
-use crate::experiment::artefacts::read_text;
 use crate::experiment::config::WorldConfig;
 use crate::experiment::exhibits::Exhibits;
+use crate::files::read_text;
 use serde::Deserialize;
 use std::path::Path;
 

@@ -43,9 +43,8 @@
 //! | `budget_violations` | steps or trajectories beyond tolerance, 0 |
 
 use super::{ReportError, statistics};
-use crate::experiment::artefacts::{
-    Chance, Evaluation, LARGEST_FILE, Manifest, Mode, Play, SCHEMA, read_at_most,
-};
+use crate::experiment::artefacts::{Chance, Evaluation, Manifest, Mode, Play, SCHEMA};
+use crate::files::{LARGEST_FILE, read_at_most};
 use crate::game::returns::{Atom, ReturnLaw};
 use lava_envs::End;
 use serde::Deserialize;
