@@ -301,6 +301,8 @@ fn sizes_beyond_reason_are_refused() {
     });
     let endless = Config::resolve(Some(Path::new("/dev/zero")), &[]).unwrap_err().to_string();
     assert!(endless.contains("larger than"), "{endless}");
+    let square = "<svg xmlns=\"http://www.w3.org/2000/svg\" width=\"50000\" height=\"50000\"/>";
+    figures::png(square).unwrap();
     let out = tempfile::tempdir().unwrap();
     let folder = out.path().join("lava-grid/eta-25/seed-1");
     fs::create_dir_all(&folder).unwrap();

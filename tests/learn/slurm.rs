@@ -3,13 +3,18 @@
 //! Needs root and the packages slurm-wlm and munge. `cargo test --test slurm -- --ignored`
 #![cfg(unix)]
 
-use assert_cmd::cargo::cargo_bin;
+mod support;
+
 use std::fs;
 use std::os::unix::fs::PermissionsExt;
 use std::path::{Path, PathBuf};
-use std::process::{Child, Command, Output, Stdio};
+use std::process::{Child, Command, Stdio};
 use std::time::{Duration, Instant};
+use support::{program, succeed, without_timing};
 use tempfile::TempDir;
+
+/// The variable that tells Slurm's programs where their configuration is.
+const SETTINGS: &str = "SLURM_CONF";
 
 /// Daemons in a folder of their own; they end with it.
 struct Cluster {
@@ -96,7 +101,7 @@ impl Cluster {
 
     fn command(&self, program: impl AsRef<std::ffi::OsStr>) -> Command {
         let mut command = Command::new(program);
-        command.env("SLURM_CONF", self.path("slurm.conf")).stdin(Stdio::null());
+        command.env(SETTINGS, self.path("slurm.conf")).stdin(Stdio::null());
         command
     }
 
@@ -148,23 +153,8 @@ episodes = 500
 exhibit_episodes = 500
 "#;
 
-fn run(command: &mut Command) -> Output {
-    let output = command.output().unwrap();
-    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
-    output
-}
-
 fn table(out: &Path) -> String {
-    let text = fs::read_to_string(out.join("table.csv")).unwrap();
-    let columns = |line: &str| line.split(',').map(str::to_owned).collect::<Vec<_>>();
-    let header = columns(text.lines().next().unwrap());
-    let kept = |column: usize| !header[column].contains("second");
-    let mut lines = Vec::new();
-    for line in text.lines() {
-        let row = columns(line);
-        lines.push((0..row.len()).filter(|&i| kept(i)).map(|i| row[i].clone()).collect::<Vec<_>>());
-    }
-    lines.into_iter().map(|row| row.join(",") + "\n").collect()
+    without_timing(&fs::read_to_string(out.join("table.csv")).unwrap())
 }
 
 /// A sweep in a folder of the cluster's, once as a job array and once by `bench`.
@@ -187,15 +177,16 @@ impl<'a> Sweep<'a> {
     }
 
     fn program(&self, verb: &str, out: &Path) -> Command {
-        let mut command = self.cluster.command(cargo_bin("cvar-game"));
-        command.arg(verb).arg("--config").arg(&self.config).arg("--out").arg(out);
+        let mut command = program(verb);
+        command.arg("--config").arg(&self.config).arg("--out").arg(out);
+        command.env(SETTINGS, self.cluster.path("slurm.conf"));
         command
     }
 
     /// Submits the array; the number of its job.
     fn submit(&self) -> String {
         let mut command = self.program("slurm", &self.out);
-        let submitted = run(command.args(["--array-limit", "2", "--submit"]));
+        let submitted = succeed(command.args(["--array-limit", "2", "--submit"]));
         let told = String::from_utf8(submitted.stdout).unwrap();
         told.split_whitespace().nth(3).unwrap().trim_end_matches(',').to_owned()
     }
@@ -220,10 +211,10 @@ impl<'a> Sweep<'a> {
         assert!(made.contains("report.html"), "{made}");
         let page = fs::read_to_string(self.out.join("report.html")).unwrap();
         assert!(page.contains("lava-point") && page.trim_end().ends_with("</html>"));
-        run(&mut self.program("bench", &self.expected));
+        succeed(&mut self.program("bench", &self.expected));
         assert_eq!(table(&self.out), table(&self.expected));
         // Nothing is left to submit.
-        let again = run(self.program("slurm", &self.out).arg("--submit"));
+        let again = succeed(self.program("slurm", &self.out).arg("--submit"));
         assert!(String::from_utf8(again.stdout).unwrap().starts_with("all runs are finished"));
     }
 }
@@ -263,11 +254,14 @@ fn the_quick_sweep_with_a_task_that_is_killed_and_requeued_ends_in_the_table_of_
     let checkpoint = sweep.folder(0).join("checkpoint-10.bin");
     cluster.until("a checkpoint", || checkpoint.exists());
     // Script and program at once, so that nobody has time to say or save anything.
-    run(cluster.command("scancel").args(["--full", "--signal=KILL", &task]));
+    succeed(cluster.command("scancel").args(["--full", "--signal=KILL", &task]));
     let state = || cluster.ask("squeue", &["-h", "-j", &task, "-o", "%T"]);
     cluster.until("the task's end", || !["RUNNING\n", "COMPLETING\n"].contains(&&*state()));
     assert!(!sweep.folder(0).join("evaluation.json").exists());
-    run(cluster.command("scontrol").args(["requeue", &task]));
-    cluster.until("the requeued task", || sweep.log(&task).contains("goes on after update"));
-    sweep.assert_ends_as_bench(Duration::from_secs(3600));
+    succeed(cluster.command("scontrol").args(["requeue", &task]));
+    // It stands in the queue behind all others.
+    let patience = Duration::from_secs(3600);
+    let resumed = || sweep.log(&task).contains("goes on after update");
+    cluster.within(patience, "the requeued task", resumed);
+    sweep.assert_ends_as_bench(patience);
 }
