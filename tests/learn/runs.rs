@@ -7,7 +7,10 @@ use cvar_game::experiment::artefacts::{Chance, Evaluation, Mode};
 use cvar_game::game::returns::ReturnLaw;
 use serde_json::Value;
 use std::fs;
+use std::io::{BufRead, BufReader};
 use std::path::{Path, PathBuf};
+use std::process::Stdio;
+use std::time::{Duration, Instant};
 use support::{program, succeed, without_timing};
 
 fn bench(config: &Path, out: &Path, jobs: &str) {
@@ -175,5 +178,25 @@ fn rollouts_are_the_episodes_of_the_evaluation_step_by_step() {
             let row: Value = serde_json::from_str(line).unwrap();
             assert_eq!(row["delta"], 1.0, "nominal chance");
         }
+    }
+}
+
+/// `rollout | head` ends with `head`.
+#[test]
+fn a_rollout_stops_when_nobody_reads_on() {
+    let folder = tempfile::tempdir().unwrap();
+    let run = train("lava-point", "40000", "300", folder.path());
+    for format in ["csv", "json"] {
+        let mut command = program("rollout");
+        // Minutes of playing.
+        command.args(["--episodes", "1000000", "--format", format, "--run"]).arg(&run);
+        let mut child = command.stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
+        let mut lines = BufReader::new(child.stdout.take().unwrap()).lines();
+        assert!(lines.next().unwrap().unwrap().contains("episode"));
+        drop(lines);
+        let start = Instant::now();
+        let output = child.wait_with_output().unwrap();
+        assert!(start.elapsed() < Duration::from_secs(60), "it has played on");
+        assert!(output.status.success() && output.stderr.is_empty(), "{output:?}");
     }
 }
