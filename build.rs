@@ -15,7 +15,9 @@ fn main() {
 fn tell_the_build() {
     let mut hash = DefaultHasher::new();
     let mut paths =
-        ["src", "envs/src", "configs/default.toml", "Cargo.lock"].map(PathBuf::from).to_vec();
+        ["src", "envs/src", "configs/default.toml", "configs/oracle.json", "Cargo.lock"]
+            .map(PathBuf::from)
+            .to_vec();
     while let Some(path) = paths.pop() {
         if path.is_dir() {
             let entries = fs::read_dir(&path).into_iter().flatten().flatten();

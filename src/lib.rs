@@ -7,6 +7,7 @@
 pub mod cli;
 pub mod exact;
 pub mod experiment;
+pub mod files;
 pub mod game;
 pub mod options;
 pub mod report;

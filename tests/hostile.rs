@@ -7,9 +7,13 @@ mod fuzz;
 use cap::Cap;
 use cvar_game::experiment::artefacts::{Evaluation, SCHEMA};
 use cvar_game::experiment::config::{Config, DEFAULT, RunConfig, Setting};
+use cvar_game::experiment::exhibits::Exhibits;
 use cvar_game::experiment::names::RunId;
 use cvar_game::experiment::{plan, runner};
-use cvar_game::report;
+use cvar_game::report::group::groups;
+use cvar_game::report::runs::Runs;
+use cvar_game::report::table::{Results, Table};
+use cvar_game::report::{self, figures, page};
 use fuzz::{fuzz, inputs};
 use lava_envs::map::{MAX_CELLS, Map};
 use std::alloc::System;
@@ -21,7 +25,18 @@ use std::time::Duration;
 #[global_allocator]
 static ALLOCATOR: Cap<System> = Cap::new(System, 1 << 30);
 
-fuzz::fuzz_targets!(configs, run_configs, settings, maps, names, evaluations);
+fuzz::fuzz_targets!(
+    configs,
+    run_configs,
+    settings,
+    maps,
+    names,
+    evaluations,
+    episodes,
+    progress,
+    exhibits,
+    constants
+);
 
 /// A file of its own with these bytes, for a parser that reads files.
 fn with_file(name: &str, bytes: &[u8], read: impl FnOnce(&Path)) {
@@ -100,8 +115,8 @@ fn names(effort: (u32, Duration)) -> u64 {
     })
 }
 
-/// A finished run as a table of results reads it.
-fn evaluations(effort: (u32, Duration)) -> u64 {
+/// A finished run of a world, as its `evaluation.json` tells of it.
+fn evaluation(env: &str) -> String {
     let law = |value: f64| {
         serde_json::json!({
             "atoms": [
@@ -117,7 +132,7 @@ fn evaluations(effort: (u32, Duration)) -> u64 {
         })
     };
     let evaluation = serde_json::json!({
-        "schema": SCHEMA, "env": "lava-grid", "eta": 25.0, "seed": 1, "steps": 10_000, "seconds": 1.0,
+        "schema": SCHEMA, "env": env, "eta": 25.0, "seed": 1, "steps": 10_000, "seconds": 1.0,
         "plays": [
             play("greedy", "nominal"), play("sampled", "nominal"), play("sampled", "antagonist"),
         ],
@@ -132,7 +147,13 @@ fn evaluations(effort: (u32, Duration)) -> u64 {
     });
     let text = serde_json::to_string_pretty(&evaluation).unwrap();
     serde_json::from_str::<Evaluation>(&text).unwrap();
-    fuzz(&inputs(vec![text.into()], "evaluations"), effort, |bytes| {
+    text
+}
+
+/// A finished run as a table of results reads it.
+fn evaluations(effort: (u32, Duration)) -> u64 {
+    let valid = vec![evaluation("lava-grid").into()];
+    fuzz(&inputs(valid, "evaluations"), effort, |bytes| {
         let out = tempfile::tempdir().unwrap();
         let folder = out.path().join("lava-grid/eta-25/seed-1");
         fs::create_dir_all(&folder).unwrap();
@@ -142,6 +163,121 @@ fn evaluations(effort: (u32, Duration)) -> u64 {
             report::table_json(out.path(), &[]).unwrap();
         }
     })
+}
+
+/// The results of another program.
+fn episodes(effort: (u32, Duration)) -> u64 {
+    let valid = vec![
+        b"return,steps,end\n0.5,12,goal\n-1.035,3,lava\n-1.4,40,timeout\n".into(),
+        b"end,return,clearance,chance,protagonist,steps\n\
+          goal,0.5,1.5,nominal,greedy,12\nlava,-1,0,antagonist,sampled,3\ngoal,1e-3,,exact,greedy,1\n"
+            .into(),
+    ];
+    fuzz(&inputs(valid, "episodes"), effort, |bytes| {
+        let parent = tempfile::tempdir().unwrap();
+        let out = parent.path().join("out");
+        let folder = out.join("lava-grid/eta-25/seed-1");
+        fs::create_dir_all(&folder).unwrap();
+        fs::write(folder.join("episodes.csv"), bytes).unwrap();
+        if report::write(&out).is_ok() {
+            report::table_json(&out, &[]).unwrap();
+        }
+        assert_eq!(fs::read_dir(&parent).unwrap().count(), 1, "it has left its folder");
+    })
+}
+
+const PROGRESS: &str =
+    "steps,player,mean_return,regret\n10000,protagonist,-1.5,1.5\n20000,antagonist,NaN,\n";
+
+/// The `exhibits.json` of a run in a small world.
+fn exhibits_of(env: &str) -> String {
+    let maps = serde_json::json!({
+        "visits": [900.0, 900.0, 900.0, 0.0], "deviations": [90.0, 9.0, 0.0, 0.0],
+    });
+    let shifts = serde_json::json!({
+        "visits": [900, 9], "shift": [[0.5, -0.5], [0.0, 0.0]], "divergence": [0.1, 0.0],
+    });
+    let world = if env == "lava-grid" {
+        serde_json::json!({"lava-grid": {
+            "occupancy": [1.0, 0.5, 0.25, 0.0], "learned": maps, "exact": maps,
+            "exact_budget": [1.0, 0.5],
+        }})
+    } else {
+        serde_json::json!({"lava-point": {
+            "trajectories": [[[0.5, 0.5], [1.5, 3.0]]], "bins": [2, 1],
+            "shifts": [shifts, shifts, shifts],
+        }})
+    };
+    let episode = serde_json::json!({
+        "chance": "antagonist", "index": 0, "end": "lava", "value": -1.0,
+        "path": [[0.0, 0.0], [1.0, 0.5]], "actions": [[0.0, 1.0]], "outcomes": [[1.0, 0.0]],
+        "ratios": [2.0], "budgets": [25.0, 12.5],
+    });
+    let exhibits = serde_json::json!({
+        "schema": SCHEMA, "episodes": 1000, "world": world, "stored": [episode],
+        "budget": {"running": [9, 8], "mean": [1.0, 0.4], "low": [1.0, 0.1], "high": [1.0, 0.8]},
+    });
+    let text = exhibits.to_string();
+    serde_json::from_str::<Exhibits>(&text).unwrap().check().unwrap();
+    text
+}
+
+/// Feeds a file of a finished run to the figures and the page, in a small world of each kind.
+fn drawn(corpus: &str, file: &str, valid: Vec<Vec<u8>>, effort: (u32, Duration)) -> u64 {
+    let out = tempfile::tempdir().unwrap();
+    let sets = ["env.lava-grid.map=\"SG\\n.L\"", "env.lava-grid.horizon=4"];
+    let sets = sets.map(|set| Setting::parse(set).unwrap());
+    let config = Config::resolve(None, &sets).unwrap();
+    let folders = ["lava-grid", "lava-point"].map(|env| {
+        let id: RunId = format!("{env}/eta-25/seed-1").parse().unwrap();
+        let folder = id.folder(out.path());
+        fs::create_dir_all(&folder).unwrap();
+        fs::write(folder.join("config.toml"), config.run(id).to_toml()).unwrap();
+        fs::write(folder.join("evaluation.json"), evaluation(env)).unwrap();
+        fs::write(folder.join("exhibits.json"), exhibits_of(env)).unwrap();
+        fs::write(folder.join("progress.csv"), PROGRESS).unwrap();
+        folder
+    });
+    let runs = Runs::read(out.path()).unwrap();
+    let results = Results { name: "", runs: &runs, groups: groups(&runs) };
+    let results = std::slice::from_ref(&results);
+    let table = Table::new(results);
+    let undamaged = figures::draw(&results[0].groups).unwrap();
+    assert_eq!(undamaged.missing, Vec::<String>::new());
+    fuzz(&inputs(valid, corpus), effort, |bytes| {
+        for folder in &folders {
+            fs::write(folder.join(file), bytes).unwrap();
+        }
+        if let Ok(figures) = figures::draw(&results[0].groups) {
+            for figure in figures.drawn.iter().filter(|figure| !undamaged.drawn.contains(figure)) {
+                figures::png(&figure.svg).unwrap();
+            }
+            page::render("results", &table, &results[0].groups, &figures).unwrap();
+        }
+    })
+}
+
+fn progress(effort: (u32, Duration)) -> u64 {
+    let valid = vec![
+        PROGRESS.into(),
+        b"update,steps,player,mean_return\n1,10000,protagonist,-1.5\n2,20000,antagonist,0.25\n"
+            .into(),
+    ];
+    drawn("progress", "progress.csv", valid, effort)
+}
+
+fn exhibits(effort: (u32, Duration)) -> u64 {
+    let valid = ["lava-grid", "lava-point"].map(|env| exhibits_of(env).into());
+    drawn("exhibits", "exhibits.json", valid.into(), effort)
+}
+
+/// The constants of a world as figures read them from the `config.toml` of a run.
+fn constants(effort: (u32, Duration)) -> u64 {
+    let valid = vec![
+        b"gamma = 1\n[env.lava-grid]\nmap = \"SG\\n.L\"\nslip = 0.1\nhorizon = 4\n".into(),
+        b"gamma = 0.9\n[env.lava-point]\narena = [8.0, 6.0]\n".into(),
+    ];
+    drawn("constants", "config.toml", valid, effort)
 }
 
 #[test]
@@ -164,5 +300,13 @@ fn sizes_beyond_reason_are_refused() {
         assert!(Config::resolve(Some(path), &[]).is_err());
     });
     let endless = Config::resolve(Some(Path::new("/dev/zero")), &[]).unwrap_err().to_string();
+    assert!(endless.contains("larger than"), "{endless}");
+    let square = "<svg xmlns=\"http://www.w3.org/2000/svg\" width=\"50000\" height=\"50000\"/>";
+    figures::png(square).unwrap();
+    let out = tempfile::tempdir().unwrap();
+    let folder = out.path().join("lava-grid/eta-25/seed-1");
+    fs::create_dir_all(&folder).unwrap();
+    std::os::unix::fs::symlink("/dev/zero", folder.join("episodes.csv")).unwrap();
+    let endless = report::write(out.path()).unwrap_err().to_string();
     assert!(endless.contains("larger than"), "{endless}");
 }

@@ -30,7 +30,7 @@ pub mod play;
 pub mod sweep;
 
 use super::{ExactError, require_eta};
-use crate::experiment::artefacts::write_in_place;
+use crate::files::write_in_place;
 use crate::game::returns::ReturnLaw;
 use controller::{Controller, Scripted};
 use lattice::Space;

@@ -16,9 +16,6 @@
 use super::names::RunId;
 use crate::game::returns::ReturnLaw;
 use serde::{Deserialize, Serialize};
-use std::fs::File;
-use std::io::{self, Read, Write};
-use std::path::Path;
 
 /// Version of the on-disk formats. A folder with another one is refused, never overwritten.
 pub const SCHEMA: u32 = 1;
@@ -177,64 +174,4 @@ impl Evaluation {
     pub fn play(&self, protagonist: Mode, chance: Chance) -> Option<&Play> {
         self.plays.iter().find(|play| play.protagonist == protagonist && play.chance == chance)
     }
-}
-
-/// How the names of files begin that are being written.
-const PART: &str = ".part-";
-
-/// Writes a file in one piece: a reader sees all of it or none.
-///
-/// # Errors
-/// If the folder or the disk refuses.
-pub fn write_in_place(path: &Path, bytes: &[u8]) -> io::Result<()> {
-    let mut file = tempfile::Builder::new();
-    file.prefix(PART);
-    #[cfg(unix)] // temporary files are private by default, artefacts are not
-    file.permissions(std::os::unix::fs::PermissionsExt::from_mode(0o666));
-    let mut file = file.tempfile_in(path.parent().unwrap_or(Path::new(".")))?;
-    file.write_all(bytes)?;
-    // Otherwise the name may reach the disk before the bytes do, and a power cut leaves an empty file.
-    file.as_file().sync_all()?;
-    file.persist(path)?;
-    Ok(())
-}
-
-/// Removes what [`write_in_place`] leaves of a file when its process is killed.
-///
-/// # Errors
-/// If the folder cannot be read or written.
-pub fn remove_parts(folder: &Path) -> io::Result<()> {
-    for entry in std::fs::read_dir(folder)? {
-        let entry = entry?;
-        if entry.file_name().as_encoded_bytes().starts_with(PART.as_bytes()) {
-            std::fs::remove_file(entry.path())?;
-        }
-    }
-    Ok(())
-}
-
-/// More bytes than any configuration, evaluation or file of weights has.
-pub const LARGEST_FILE: u64 = 64 << 20;
-
-/// The bytes of a file that may come from elsewhere.
-///
-/// # Errors
-/// If it cannot be read or is longer than `limit`.
-pub fn read_at_most(path: &Path, limit: u64) -> io::Result<Vec<u8>> {
-    let mut bytes = Vec::new();
-    File::open(path)?.take(limit + 1).read_to_end(&mut bytes)?;
-    if bytes.len() as u64 > limit {
-        let problem = format!("it is larger than {limit} bytes");
-        return Err(io::Error::new(io::ErrorKind::FileTooLarge, problem));
-    }
-    Ok(bytes)
-}
-
-/// The text of a file that may come from elsewhere.
-///
-/// # Errors
-/// If it cannot be read, is no text or is longer than [`LARGEST_FILE`].
-pub fn read_text(path: &Path) -> io::Result<String> {
-    String::from_utf8(read_at_most(path, LARGEST_FILE)?)
-        .map_err(|error| io::Error::new(io::ErrorKind::InvalidData, error))
 }

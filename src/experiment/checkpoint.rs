@@ -12,7 +12,8 @@
 //! A file that is damaged or belongs to another run is passed over for the one before it. The sizes
 //! of all parts are checked against the run, so a file from elsewhere can at worst be refused.
 
-use super::artefacts::{SCHEMA, read_at_most, write_in_place};
+use super::artefacts::SCHEMA;
+use crate::files::{read_at_most, write_in_place};
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 use std::fs;

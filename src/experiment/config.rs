@@ -252,7 +252,11 @@ impl WorldConfig {
         Ok(config)
     }
 
-    fn validate(&self) -> Result<(), ConfigError> {
+    /// Checks all numbers against their ranges.
+    ///
+    /// # Errors
+    /// Names the number that is out of range.
+    pub fn validate(&self) -> Result<(), ConfigError> {
         match self {
             WorldConfig::LavaGrid(config) => config.validate(),
             WorldConfig::LavaPoint(config) => config.validate(),

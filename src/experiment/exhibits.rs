@@ -56,7 +56,8 @@ impl Exhibits {
                         .into_iter()
                         .all(|length| Some(length) == bins)
                 };
-                (point.shifts.is_empty() || point.shifts.len() == BUDGET_CLASSES)
+                bins.is_some()
+                    && (point.shifts.is_empty() || point.shifts.len() == BUDGET_CLASSES)
                     && point.shifts.iter().all(whole)
             }
         };

@@ -11,11 +11,12 @@
 
 mod worker;
 
-use super::artefacts::{Evaluation, Manifest, SCHEMA, read_text, write_in_place};
+use super::artefacts::{Evaluation, Manifest, SCHEMA};
 use super::checkpoint;
 use super::config::{Config, ConfigError, RunConfig};
 use super::lock::RunLock;
 use super::names::RunId;
+use crate::files::{read_text, write_in_place};
 use serde::{Deserialize, Deserializer, Serialize};
 use std::collections::VecDeque;
 use std::fs;

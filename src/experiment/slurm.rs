@@ -11,10 +11,10 @@
 //! A minute before its time limit a task gets SIGTERM; it writes a checkpoint, exits with
 //! [`RESUME`] and is put into the queue again.
 
-use super::artefacts::write_in_place;
 use super::config::Config;
 use super::names::RunId;
 use super::stop::RESUME;
+use crate::files::write_in_place;
 use std::fmt::Write as _;
 use std::io;
 use std::num::NonZeroUsize;

@@ -83,6 +83,11 @@ pub trait Watcher<W: Arena> {
 
     /// What happened in that step of the episode; the world is the one after it.
     fn after(&mut self, contest: &Contest<W>, slot: usize, episode: usize);
+
+    /// Whether the rest need not be played.
+    fn has_enough(&self) -> bool {
+        false
+    }
 }
 
 /// Nobody.
@@ -93,6 +98,7 @@ impl<W: Arena> Watcher<W> for () {
 }
 
 /// Plays the episodes in the slots of `world`; a slot takes the next episode when its own has ended.
+/// Once the watcher has enough, what was not played yet stays without meaning.
 pub fn play<W: Arena>(
     world: W,
     pair: &Pair<W>,
@@ -111,7 +117,7 @@ pub fn play<W: Arena>(
         contest.start(slot, play.eta);
         contest.idle[slot] = episode >= played.len();
     }
-    while contest.idle.iter().any(|idle| !idle) {
+    while contest.idle.iter().any(|idle| !idle) && !watcher.has_enough() {
         for slot in (0..slots).filter(|&slot| !contest.idle[slot]) {
             watcher.before(&contest.world, slot);
         }

@@ -2,9 +2,9 @@
 
 use super::ReportError;
 use super::runs::{Run, read_json};
-use crate::experiment::artefacts::read_text;
 use crate::experiment::config::WorldConfig;
 use crate::experiment::exhibits::Exhibits;
+use crate::files::read_text;
 use serde::Deserialize;
 use std::path::Path;
 
@@ -68,10 +68,12 @@ struct Constants {
 /// Constants of the world and gamma.
 pub(super) fn world(path: &Path) -> Result<Option<(WorldConfig, f64)>, ReportError> {
     let Some(text) = text(path)? else { return Ok(None) };
-    let constants: Constants = toml::from_str(&text).map_err(|error| ReportError::Corrupt {
+    let corrupt = |what: &str| ReportError::Corrupt {
         path: path.to_path_buf(),
-        what: error.message().split_whitespace().collect::<Vec<_>>().join(" "),
-    })?;
+        what: what.split_whitespace().collect::<Vec<_>>().join(" "),
+    };
+    let constants: Constants = toml::from_str(&text).map_err(|error| corrupt(error.message()))?;
+    constants.env.validate().map_err(|error| corrupt(&error.to_string()))?;
     Ok(Some((constants.env, constants.gamma)))
 }
 

@@ -25,12 +25,12 @@ pub mod runs;
 pub mod statistics;
 pub mod table;
 
+use crate::files::write_in_place;
 use figures::Figures;
 use group::groups;
 use latex::Latex;
 use render::{Csv, Json, Markdown, Render, Terminal};
 use runs::Runs;
-use std::io::Write as _;
 use std::path::{Path, PathBuf};
 use table::{Results, Table};
 
@@ -173,9 +173,10 @@ fn persist_figures(dir: &Path, figures: &Figures) -> Result<(), ReportError> {
     std::fs::create_dir_all(&folder)
         .map_err(|source| ReportError::Write { path: folder.clone(), source })?;
     for figure in &figures.drawn {
-        let stem = folder.join(&figure.name);
-        persist(&stem.with_extension("svg"), figure.svg.as_bytes())?;
-        let path = stem.with_extension("png");
+        // The name of a world may have a dot.
+        let file = |ending| folder.join(format!("{}.{ending}", figure.name));
+        persist(&file("svg"), figure.svg.as_bytes())?;
+        let path = file("png");
         let png = figures::png(&figure.svg).map_err(|what| ReportError::Write {
             path: path.clone(),
             source: std::io::Error::other(what),
@@ -218,15 +219,6 @@ fn write_table(table: &Table, stem: &Path) -> Result<String, ReportError> {
 }
 
 fn persist(path: &Path, bytes: &[u8]) -> Result<(), ReportError> {
-    let attempt = || {
-        let mut builder = tempfile::Builder::new();
-        builder.prefix(".report-");
-        // A temporary file is private by default; results are for everybody the umask admits.
-        #[cfg(unix)]
-        builder.permissions(std::os::unix::fs::PermissionsExt::from_mode(0o666));
-        let mut file = builder.tempfile_in(path.parent().unwrap_or(Path::new(".")))?;
-        file.write_all(bytes)?;
-        file.persist(path).map_err(|failed| failed.error)
-    };
-    attempt().map(|_| ()).map_err(|source| ReportError::Write { path: path.to_path_buf(), source })
+    write_in_place(path, bytes)
+        .map_err(|source| ReportError::Write { path: path.to_path_buf(), source })
 }

@@ -204,8 +204,8 @@ fn player(episodes: &Episodes) -> Markup {
             output id="told" aria-live="off" {}
             canvas id="scene" width="1000" height="700" role="img" aria-label="the episode in its world" {}
         }
-        // A closing tag inside the data would end the script.
-        script id="episodes" type="application/json" { (PreEscaped(json.replace("</", "<\\/"))) }
+        // A tag or a comment inside the data would end the script, or keep it from ending.
+        script id="episodes" type="application/json" { (PreEscaped(json.replace('<', "\\u003c"))) }
     }
 }
 

@@ -7,7 +7,7 @@
 //!
 //! Results of other programs enter the same tables without a `manifest.json`: with an
 //! `evaluation.json`, or simply with an `episodes.csv`, which has a line per episode and these columns
-//! in any order:
+//! in any order (at most 64 MiB, some three million episodes):
 //!
 //! | column | meaning |
 //! |---|---|
@@ -43,9 +43,8 @@
 //! | `budget_violations` | steps or trajectories beyond tolerance, 0 |
 
 use super::{ReportError, statistics};
-use crate::experiment::artefacts::{
-    Chance, Evaluation, LARGEST_FILE, Manifest, Mode, Play, SCHEMA, read_at_most,
-};
+use crate::experiment::artefacts::{Chance, Evaluation, Manifest, Mode, Play, SCHEMA};
+use crate::files::{LARGEST_FILE, read_at_most};
 use crate::game::returns::{Atom, ReturnLaw};
 use lava_envs::End;
 use serde::Deserialize;
@@ -367,14 +366,14 @@ fn read_episodes(
     eta: f64,
     seed: u64,
 ) -> Result<Option<Evaluation>, ReportError> {
-    let file = match std::fs::File::open(path) {
-        Ok(file) => file,
+    let text = match read_at_most(path, LARGEST_FILE) {
+        Ok(text) => text,
         Err(error) if error.kind() == std::io::ErrorKind::NotFound => return Ok(None),
         Err(source) => return Err(ReportError::Read { path: path.to_path_buf(), source }),
     };
     let corrupt = |what: String| ReportError::Corrupt { path: path.to_path_buf(), what };
     let mut episodes: Vec<Episode> = Vec::new();
-    for line in csv::Reader::from_reader(std::io::BufReader::new(file)).deserialize() {
+    for line in csv::Reader::from_reader(&text[..]).deserialize() {
         episodes.push(line.map_err(|error| corrupt(error.to_string()))?);
     }
     if episodes.is_empty() {

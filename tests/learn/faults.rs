@@ -2,13 +2,15 @@
 //! files, full disks, crashed workers, two programs in one folder.
 #![cfg(unix)]
 
-use assert_cmd::cargo::cargo_bin;
+mod support;
+
 use cvar_game::experiment::tensorboard;
 use std::collections::BTreeMap;
 use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Output, Stdio};
 use std::time::{Duration, Instant};
+use support::{program, succeed, without_timing};
 use tempfile::TempDir;
 
 /// A sweep of two runs in each world: 30 updates each, in a second or two.
@@ -60,10 +62,10 @@ impl Sweep {
     }
 
     fn command(&self, verb: &str, rest: &[&str]) -> Command {
-        let mut command = Command::new(cargo_bin("cvar-game"));
-        command.arg(verb).arg("--config").arg(self.folder.path().join("faults.toml"));
+        let mut command = program(verb);
+        command.arg("--config").arg(self.folder.path().join("faults.toml"));
         command.arg("--out").arg(self.out()).args(rest);
-        command.stdin(Stdio::null()).stdout(Stdio::piped()).stderr(Stdio::piped());
+        command.stdout(Stdio::piped()).stderr(Stdio::piped());
         command
     }
 
@@ -86,7 +88,7 @@ fn result(folder: &Path) -> BTreeMap<String, Vec<u8>> {
         let bytes = fs::read(&path).unwrap();
         let bytes = match name.as_str() {
             ".lock" => continue,
-            "progress.csv" => without_columns(&bytes, &["steps_per_second", "seconds"]),
+            "progress.csv" => without_timing(str::from_utf8(&bytes).unwrap()).into_bytes(),
             "evaluation.json" | "manifest.json" => {
                 let mut json: serde_json::Value = serde_json::from_slice(&bytes).unwrap();
                 json["seconds"] = 0.into();
@@ -101,30 +103,13 @@ fn result(folder: &Path) -> BTreeMap<String, Vec<u8>> {
     files
 }
 
-/// A CSV file without the columns whose names begin so.
-fn without_columns(bytes: &[u8], names: &[&str]) -> Vec<u8> {
-    let mut reader = csv::Reader::from_reader(bytes);
-    let header = reader.headers().unwrap().clone();
-    let kept: Vec<usize> = (0..header.len())
-        .filter(|&column| !names.iter().any(|name| header[column].starts_with(name)))
-        .collect();
-    let mut text = String::new();
-    for record in std::iter::once(Ok(header.clone())).chain(reader.records()) {
-        let record = record.unwrap();
-        let row: Vec<&str> = kept.iter().map(|&column| &record[column]).collect();
-        text += &(row.join(",") + "\n");
-    }
-    text.into_bytes()
-}
-
 /// What the sweep comes to if nothing happens to it.
 fn undisturbed() -> &'static BTreeMap<String, BTreeMap<String, Vec<u8>>> {
     static RESULT: std::sync::OnceLock<BTreeMap<String, BTreeMap<String, Vec<u8>>>> =
         std::sync::OnceLock::new();
     RESULT.get_or_init(|| {
         let sweep = Sweep::new();
-        let output = sweep.bench(&["--jobs", "2"]);
-        assert!(output.status.success(), "{}", stderr(&output));
+        succeed(&mut sweep.command("bench", &["--jobs", "2"]));
         let mut results: BTreeMap<_, _> =
             RUNS.map(|run| (run.to_owned(), result(&sweep.run(run)))).into();
         results.insert("sweep".into(), BTreeMap::from([("runs.csv".into(), table(&sweep))]));
@@ -134,8 +119,7 @@ fn undisturbed() -> &'static BTreeMap<String, BTreeMap<String, Vec<u8>>> {
 
 /// `runs.csv` without its timing.
 fn table(sweep: &Sweep) -> Vec<u8> {
-    let bytes = fs::read(sweep.out().join("runs.csv")).unwrap();
-    without_columns(&bytes, &["steps_per_second", "seconds"])
+    without_timing(&fs::read_to_string(sweep.out().join("runs.csv")).unwrap()).into_bytes()
 }
 
 #[track_caller]
@@ -359,8 +343,8 @@ fn one_run_of_a_sweep_can_be_asked_for() {
 fn a_folder_that_cannot_be_written_is_refused() {
     let sweep = Sweep::new();
     // /proc takes no folders, not even from root.
-    let mut command = Command::new(cargo_bin("cvar-game"));
-    command.args(["bench", "--out", "/proc/cvar-game", "--config"]);
+    let mut command = program("bench");
+    command.args(["--out", "/proc/cvar-game", "--config"]);
     let output = command.arg(sweep.folder.path().join("faults.toml")).output().unwrap();
     assert_eq!(output.status.code(), Some(2));
     assert!(stderr(&output).contains("cannot write to /proc/cvar-game"), "{}", stderr(&output));

@@ -1,25 +1,31 @@
 //! Whole runs through the program: the same bits from the same seed, and evaluations that agree with
 //! exact laws.
 
-use assert_cmd::Command;
+mod support;
+
 use cvar_game::experiment::artefacts::{Chance, Evaluation, Mode};
 use cvar_game::game::returns::ReturnLaw;
 use serde_json::Value;
 use std::fs;
-use std::path::Path;
-
-fn program() -> Command {
-    Command::cargo_bin("cvar-game").unwrap()
-}
+use std::io::{BufRead, BufReader};
+use std::path::{Path, PathBuf};
+use std::process::Stdio;
+use std::time::{Duration, Instant};
+use support::{program, succeed, without_timing};
 
 fn bench(config: &Path, out: &Path, jobs: &str) {
-    program()
-        .args(["bench", "--jobs", jobs, "--config"])
-        .arg(config)
-        .arg("--out")
-        .arg(out)
-        .assert()
-        .success();
+    let mut command = program("bench");
+    succeed(command.args(["--jobs", jobs, "--config"]).arg(config).arg("--out").arg(out));
+}
+
+/// Trains for so many steps at eta = 25 and evaluates with few episodes; the folder of the run.
+fn train(env: &str, steps: &str, exhibit_episodes: &str, out: &Path) -> PathBuf {
+    let exhibits = format!("evaluation.exhibit_episodes={exhibit_episodes}");
+    let mut command = program("train");
+    command.args(["--env", env, "--eta", "25", "--seed", "1", "--steps", steps]);
+    command.args(["--set", "evaluation.episodes=300", "--set", &exhibits, "--out"]).arg(out);
+    succeed(&mut command);
+    out.join(env).join("eta-25/seed-1")
 }
 
 const SMALL: &str = r#"
@@ -43,11 +49,6 @@ const RUNS: [&str; 8] = [
     "lava-point/eta-25/seed-1",
     "lava-point/eta-25/seed-2",
 ];
-
-fn without_timing(text: &str) -> Vec<Vec<&str>> {
-    let columns = |line: &'_ str| line.split(',').count() - 2;
-    text.lines().map(|line| line.split(',').take(columns(line)).collect()).collect()
-}
 
 fn read(path: &Path) -> String {
     fs::read_to_string(path).unwrap()
@@ -90,23 +91,12 @@ fn one_seed_gives_the_same_bits_whatever_the_jobs() {
 /// antagonist with the CVaR.
 fn exact_laws_agree_with(episodes: u64) {
     let folder = tempfile::tempdir().unwrap();
-    program()
-        .args(["train", "--env", "lava-grid", "--eta", "25", "--seed", "1", "--steps", "300000"])
-        .args(["--set", "evaluation.episodes=500", "--set", "evaluation.exhibit_episodes=20000"])
-        .arg("--out")
-        .arg(folder.path())
-        .assert()
-        .success();
-    let run = folder.path().join("lava-grid/eta-25/seed-1");
+    let run = train("lava-grid", "300000", "20000", folder.path());
     let exact = evaluation(&run.join("evaluation.json"));
     let play = |antagonist: &str| -> Value {
-        let output = program()
-            .arg("evaluate")
-            .arg(&run)
-            .args(["--antagonist", antagonist, "--json", "--episodes", &episodes.to_string()])
-            .output()
-            .unwrap();
-        assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+        let mut command = program("evaluate");
+        command.args(["--antagonist", antagonist, "--json", "--episodes", &episodes.to_string()]);
+        let output = succeed(command.arg(&run));
         serde_json::from_slice(&output.stdout).unwrap()
     };
     let nominal = play("nominal");
@@ -152,22 +142,12 @@ fn exact_laws_agree_with_a_million_episodes() {
 fn rollouts_are_the_episodes_of_the_evaluation_step_by_step() {
     let folder = tempfile::tempdir().unwrap();
     for env in ["lava-grid", "lava-point"] {
-        program()
-            .args(["train", "--env", env, "--eta", "25", "--seed", "1", "--steps", "40000"])
-            .args(["--set", "evaluation.episodes=300", "--set", "evaluation.exhibit_episodes=300"])
-            .arg("--out")
-            .arg(folder.path())
-            .assert()
-            .success();
-        let run = folder.path().join(env).join("eta-25/seed-1");
+        let run = train(env, "40000", "300", folder.path());
         let law = &evaluation(&run.join("evaluation.json"));
         let law = &law.play(Mode::Greedy, Chance::Antagonist).unwrap().law;
-        let output = program()
-            .args(["rollout", "--antagonist", "learned", "--episodes", "300", "--run"])
-            .arg(&run)
-            .output()
-            .unwrap();
-        assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+        let mut command = program("rollout");
+        command.args(["--antagonist", "learned", "--episodes", "300", "--run"]);
+        let output = succeed(command.arg(&run));
         let mut reader = csv::Reader::from_reader(&output.stdout[..]);
         let head = reader.headers().unwrap().clone();
         let column = |name: &str| head.iter().position(|column| column == name).unwrap();
@@ -191,14 +171,32 @@ fn rollouts_are_the_episodes_of_the_evaluation_step_by_step() {
         assert_eq!(episodes, 300);
         assert!((sum / 300.0 - law.mean()).abs() < 1e-9, "{} against {}", sum / 300.0, law.mean());
 
-        let json = program()
-            .args(["rollout", "--episodes", "3", "--format", "json", "--run"])
-            .arg(&run)
-            .output()
-            .unwrap();
+        let mut command = program("rollout");
+        command.args(["--episodes", "3", "--format", "json", "--run"]);
+        let json = succeed(command.arg(&run));
         for line in String::from_utf8(json.stdout).unwrap().lines() {
             let row: Value = serde_json::from_str(line).unwrap();
             assert_eq!(row["delta"], 1.0, "nominal chance");
         }
+    }
+}
+
+/// `rollout | head` ends with `head`.
+#[test]
+fn a_rollout_stops_when_nobody_reads_on() {
+    let folder = tempfile::tempdir().unwrap();
+    let run = train("lava-point", "40000", "300", folder.path());
+    for format in ["csv", "json"] {
+        let mut command = program("rollout");
+        // Minutes of playing.
+        command.args(["--episodes", "1000000", "--format", format, "--run"]).arg(&run);
+        let mut child = command.stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
+        let mut lines = BufReader::new(child.stdout.take().unwrap()).lines();
+        assert!(lines.next().unwrap().unwrap().contains("episode"));
+        drop(lines);
+        let start = Instant::now();
+        let output = child.wait_with_output().unwrap();
+        assert!(start.elapsed() < Duration::from_secs(60), "it has played on");
+        assert!(output.status.success() && output.stderr.is_empty(), "{output:?}");
     }
 }

@@ -3,13 +3,18 @@
 //! Needs root and the packages slurm-wlm and munge. `cargo test --test slurm -- --ignored`
 #![cfg(unix)]
 
-use assert_cmd::cargo::cargo_bin;
+mod support;
+
 use std::fs;
 use std::os::unix::fs::PermissionsExt;
 use std::path::{Path, PathBuf};
-use std::process::{Child, Command, Output, Stdio};
+use std::process::{Child, Command, Stdio};
 use std::time::{Duration, Instant};
+use support::{program, succeed, without_timing};
 use tempfile::TempDir;
+
+/// The variable that tells Slurm's programs where their configuration is.
+const SETTINGS: &str = "SLURM_CONF";
 
 /// Daemons in a folder of their own; they end with it.
 struct Cluster {
@@ -96,7 +101,7 @@ impl Cluster {
 
     fn command(&self, program: impl AsRef<std::ffi::OsStr>) -> Command {
         let mut command = Command::new(program);
-        command.env("SLURM_CONF", self.path("slurm.conf")).stdin(Stdio::null());
+        command.env(SETTINGS, self.path("slurm.conf")).stdin(Stdio::null());
         command
     }
 
@@ -113,9 +118,13 @@ impl Cluster {
     }
 
     fn until(&self, what: &str, condition: impl Fn() -> bool) {
+        self.within(Duration::from_secs(120), what, condition);
+    }
+
+    fn within(&self, patience: Duration, what: &str, condition: impl Fn() -> bool) {
         let start = Instant::now();
         while !condition() {
-            if start.elapsed() > Duration::from_secs(120) {
+            if start.elapsed() > patience {
                 for log in ["munged.out", "slurmctld.log", "slurmd.log"] {
                     let text = fs::read_to_string(self.path(log)).unwrap_or_default();
                     eprintln!("--- {log}\n{text}");
@@ -144,64 +153,115 @@ episodes = 500
 exhibit_episodes = 500
 "#;
 
-fn run(command: &mut Command) -> Output {
-    let output = command.output().unwrap();
-    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
-    output
+fn table(out: &Path) -> String {
+    without_timing(&fs::read_to_string(out.join("table.csv")).unwrap())
 }
 
-fn table(out: &Path) -> String {
-    let text = fs::read_to_string(out.join("table.csv")).unwrap();
-    let columns = |line: &str| line.split(',').map(str::to_owned).collect::<Vec<_>>();
-    let header = columns(text.lines().next().unwrap());
-    let kept = |column: usize| !header[column].contains("second");
-    let mut lines = Vec::new();
-    for line in text.lines() {
-        let row = columns(line);
-        lines.push((0..row.len()).filter(|&i| kept(i)).map(|i| row[i].clone()).collect::<Vec<_>>());
+/// A sweep in a folder of the cluster's, once as a job array and once by `bench`.
+struct Sweep<'a> {
+    cluster: &'a Cluster,
+    config: PathBuf,
+    out: PathBuf,
+    expected: PathBuf,
+}
+
+impl<'a> Sweep<'a> {
+    fn new(cluster: &'a Cluster, config: &str) -> Self {
+        // A name that a careless script would take apart.
+        let folder = cluster.path("the user's 100% folder");
+        fs::create_dir(&folder).unwrap();
+        let path = folder.join("drill.toml");
+        fs::write(&path, config).unwrap();
+        let (out, expected) = (folder.join("out"), folder.join("expected"));
+        Sweep { cluster, config: path, out, expected }
     }
-    lines.into_iter().map(|row| row.join(",") + "\n").collect()
+
+    fn program(&self, verb: &str, out: &Path) -> Command {
+        let mut command = program(verb);
+        command.arg("--config").arg(&self.config).arg("--out").arg(out);
+        command.env(SETTINGS, self.cluster.path("slurm.conf"));
+        command
+    }
+
+    /// Submits the array; the number of its job.
+    fn submit(&self) -> String {
+        let mut command = self.program("slurm", &self.out);
+        let submitted = succeed(command.args(["--array-limit", "2", "--submit"]));
+        let told = String::from_utf8(submitted.stdout).unwrap();
+        told.split_whitespace().nth(3).unwrap().trim_end_matches(',').to_owned()
+    }
+
+    /// The folder of the run of this task.
+    fn folder(&self, task: usize) -> PathBuf {
+        let runs = fs::read_to_string(self.out.join("slurm/runs.txt")).unwrap();
+        self.out.join(runs.lines().nth(task).unwrap())
+    }
+
+    /// What the task of this name has said so far.
+    fn log(&self, task: &str) -> String {
+        fs::read_to_string(self.out.join(format!("slurm/{task}.log"))).unwrap_or_default()
+    }
+
+    /// The array ends in the table of `bench`, which is carried out here, and in the page.
+    fn assert_ends_as_bench(&self, patience: Duration) {
+        let cluster = self.cluster;
+        let ended = || cluster.ask("squeue", &["-h"]).is_empty();
+        cluster.within(patience, "the end of all jobs", ended);
+        let made = fs::read_to_string(self.out.join("slurm/table.log")).unwrap();
+        assert!(made.contains("report.html"), "{made}");
+        let page = fs::read_to_string(self.out.join("report.html")).unwrap();
+        assert!(page.contains("lava-point") && page.trim_end().ends_with("</html>"));
+        succeed(&mut self.program("bench", &self.expected));
+        assert_eq!(table(&self.out), table(&self.expected));
+        // Nothing is left to submit.
+        let again = succeed(self.program("slurm", &self.out).arg("--submit"));
+        assert!(String::from_utf8(again.stdout).unwrap().starts_with("all runs are finished"));
+    }
 }
 
 #[test]
 #[ignore = "needs root, slurm-wlm and munge"]
 fn an_array_with_a_task_that_is_stopped_and_requeued_ends_in_the_table_of_bench() {
     let cluster = Cluster::start();
-    // A name that a careless script would take apart.
-    let folder = cluster.path("the user's 100% folder");
-    fs::create_dir(&folder).unwrap();
-    let config = folder.join("drill.toml");
-    fs::write(&config, CONFIG).unwrap();
-    let (out, expected) = (folder.join("out"), folder.join("expected"));
-    let program = |verb: &str, out: &Path| {
-        let mut command = cluster.command(cargo_bin("cvar-game"));
-        command.arg(verb).arg("--config").arg(&config).arg("--out").arg(out);
-        command
-    };
-    let submitted = run(program("slurm", &out).args(["--array-limit", "2", "--submit"]));
-    let told = String::from_utf8(submitted.stdout).unwrap();
-    let job = told.split_whitespace().nth(3).unwrap().trim_end_matches(',').to_owned();
-
-    let runs = fs::read_to_string(out.join("slurm/runs.txt")).unwrap();
-    let first = out.join(runs.lines().next().unwrap());
-    cluster.until("a checkpoint", || first.join("checkpoint-5.bin").exists());
-    let task = format!("{job}_0");
+    let sweep = Sweep::new(&cluster, CONFIG);
+    let task = format!("{}_0", sweep.submit());
+    let checkpoint = sweep.folder(0).join("checkpoint-5.bin");
+    cluster.until("a checkpoint", || checkpoint.exists());
     // It repeats itself while the task is on its way back into the queue.
     let mut scancel = cluster.command("scancel");
     let mut scancel = scancel.args(["--batch", "--signal=TERM", &task]).spawn().unwrap();
-    let log = out.join(format!("slurm/{job}_0.log"));
-    let logged = || fs::read_to_string(&log).unwrap_or_default();
-    cluster.until("the requeued task", || logged().contains("goes on after update"));
-    assert!(logged().contains("the same command goes on"), "{}", logged());
+    cluster.until("the requeued task", || sweep.log(&task).contains("goes on after update"));
+    let log = sweep.log(&task);
+    assert!(log.contains("the same command goes on"), "{log}");
     let _ = scancel.kill();
     scancel.wait().unwrap();
+    sweep.assert_ends_as_bench(Duration::from_secs(120));
+}
 
-    cluster.until("the end of all jobs", || cluster.ask("squeue", &["-h"]).is_empty());
-    let made = fs::read_to_string(out.join("slurm/table.log")).unwrap();
-    assert!(made.contains("lava-point"), "{made}");
-    run(&mut program("bench", &expected));
-    assert_eq!(table(&out), table(&expected));
-    // Nothing is left to submit.
-    let again = run(program("slurm", &out).arg("--submit"));
-    assert!(String::from_utf8(again.stdout).unwrap().starts_with("all runs are finished"));
+/// With release binaries minutes of two cores. `DRILL_CONFIG` may name another sweep than the quick one.
+#[test]
+#[ignore = "needs root, slurm-wlm and munge, and takes minutes"]
+fn the_quick_sweep_with_a_task_that_is_killed_and_requeued_ends_in_the_table_of_bench() {
+    let quick = || {
+        let configs = Path::new(env!("CARGO_MANIFEST_DIR")).ancestors();
+        configs.map(|at| at.join("configs/quick.toml")).find(|path| path.exists()).unwrap()
+    };
+    let config = std::env::var_os("DRILL_CONFIG").map_or_else(quick, PathBuf::from);
+    let config = fs::read_to_string(config).unwrap() + "\n[checkpoint]\nevery = 10\n";
+    let cluster = Cluster::start();
+    let sweep = Sweep::new(&cluster, &config);
+    let task = format!("{}_0", sweep.submit());
+    let checkpoint = sweep.folder(0).join("checkpoint-10.bin");
+    cluster.until("a checkpoint", || checkpoint.exists());
+    // Script and program at once, so that nobody has time to say or save anything.
+    succeed(cluster.command("scancel").args(["--full", "--signal=KILL", &task]));
+    let state = || cluster.ask("squeue", &["-h", "-j", &task, "-o", "%T"]);
+    cluster.until("the task's end", || !["RUNNING\n", "COMPLETING\n"].contains(&&*state()));
+    assert!(!sweep.folder(0).join("evaluation.json").exists());
+    succeed(cluster.command("scontrol").args(["requeue", &task]));
+    // It stands in the queue behind all others.
+    let patience = Duration::from_secs(3600);
+    let resumed = || sweep.log(&task).contains("goes on after update");
+    cluster.within(patience, "the requeued task", resumed);
+    sweep.assert_ends_as_bench(patience);
 }

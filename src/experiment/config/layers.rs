@@ -1,7 +1,7 @@
 //! Layers of keys: reading, checking against the default's keys, merging.
 
 use super::{ConfigError, DEFAULT, WorldName, one_line, rules};
-use crate::experiment::artefacts::read_text;
+use crate::files::read_text;
 use std::path::Path;
 use toml::{Table, Value};
 

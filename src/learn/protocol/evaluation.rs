@@ -16,10 +16,9 @@ use cvar_game::exact::antagonist::WorstCase;
 use cvar_game::exact::grid::ExactGrid;
 use cvar_game::exact::oracle;
 use cvar_game::exact::policy::Policy;
-use cvar_game::experiment::artefacts::{
-    Audit, Certificate, Chance, LARGEST_FILE, Mode, Play, read_at_most,
-};
+use cvar_game::experiment::artefacts::{Audit, Certificate, Chance, Mode, Play};
 use cvar_game::experiment::config::{Device, Oracle, RunConfig, WorldConfig};
+use cvar_game::files::{LARGEST_FILE, read_at_most};
 use lava_envs::law::{FiniteLaw, MOVES, sample_index};
 use lava_envs::random::ChaCha8Rng;
 use lava_envs::{ConfigError, GridConfig, LavaGrid, LavaPoint, PointConfig, World};

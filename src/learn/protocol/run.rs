@@ -8,15 +8,14 @@ use super::exhibits::{Exhibited, RegretMeter, exhibits};
 use super::failure::RunError;
 use crate::train::{Game, Progress, Training};
 use crate::weights;
-use cvar_game::experiment::artefacts::{
-    BUILD, Evaluation, Manifest, SCHEMA, remove_parts, write_in_place,
-};
+use cvar_game::experiment::artefacts::{BUILD, Evaluation, Manifest, SCHEMA};
 use cvar_game::experiment::checkpoint::{self, Checkpoint, CheckpointError, Extent};
 use cvar_game::experiment::config::{RunConfig, WorldConfig};
 use cvar_game::experiment::lock::RunLock;
 use cvar_game::experiment::runner::{Report, Tick, read_evaluation};
 use cvar_game::experiment::stop::Stop;
 use cvar_game::experiment::tensorboard::EventFile;
+use cvar_game::files::{remove_parts, write_in_place};
 use lava_envs::{LavaGrid, LavaPoint};
 use std::fs::{self, File, OpenOptions};
 use std::io::{self, Read, Seek, SeekFrom, Write};

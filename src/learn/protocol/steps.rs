@@ -217,6 +217,11 @@ impl<W: Recorded> Watcher<W> for Rows<'_> {
             self.next += 1;
         }
     }
+
+    /// An output that takes no more takes none of what would follow.
+    fn has_enough(&self) -> bool {
+        self.failure.is_some()
+    }
 }
 
 struct Writer<'a> {

@@ -69,10 +69,16 @@ pub(super) struct Axes {
     pub y_title: &'static str,
 }
 
+/// Whether an axis can hold a number: beyond this there is nothing to be seen, and ticks would be
+/// counted for ever.
+pub(super) fn drawable(value: f64) -> bool {
+    value.abs() <= 1e12
+}
+
 /// Finitely many numbers as a range with some air.
 pub(super) fn span(values: impl Iterator<Item = f64>) -> Option<std::ops::Range<f64>> {
     let (low, high) = values
-        .filter(|value| value.is_finite())
+        .filter(|value| drawable(*value))
         .fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), v| (low.min(v), high.max(v)));
     let air = 0.05 * (high - low).max(0.02).max(1e-3 * low.abs().max(high.abs()));
     (low <= high).then_some(low - air..high + air)
@@ -175,16 +181,22 @@ static FONTS: LazyLock<Arc<resvg::usvg::fontdb::Database>> = LazyLock::new(|| {
     Arc::new(fonts)
 });
 
-/// The SVG as PNG, pixel by unit.
+/// The most pixels of a PNG.
+const MOST_PIXELS: f64 = 4e7;
+
+/// The SVG as PNG, pixel by unit unless it is too large for that.
 ///
 /// # Errors
 /// If it is no SVG.
 pub fn png(svg: &str) -> Result<Vec<u8>, String> {
     let options = resvg::usvg::Options { fontdb: Arc::clone(&FONTS), ..Default::default() };
     let tree = resvg::usvg::Tree::from_str(svg, &options).map_err(|error| error.to_string())?;
-    let size = tree.size().to_int_size();
-    let mut pixels = resvg::tiny_skia::Pixmap::new(size.width(), size.height())
-        .ok_or("the picture has no size")?;
-    resvg::render(&tree, resvg::tiny_skia::Transform::identity(), &mut pixels.as_mut());
+    let (width, height) = (tree.size().width(), tree.size().height());
+    let scale = (MOST_PIXELS / (f64::from(width) * f64::from(height))).sqrt().min(1.0) as f32;
+    let [width, height] = [width, height].map(|side| (side * scale).round().max(1.0) as u32);
+    let mut pixels =
+        resvg::tiny_skia::Pixmap::new(width, height).ok_or("the picture has no size")?;
+    let transform = resvg::tiny_skia::Transform::from_scale(scale, scale);
+    resvg::render(&tree, transform, &mut pixels.as_mut());
     pixels.encode_png().map_err(|error| error.to_string())
 }

@@ -2,7 +2,8 @@
 
 use super::Panel;
 use super::canvas::{
-    Axes, INK, TEXT, chart, colour, figure, frame, heat, legend, on, scale, short, span, text,
+    Axes, INK, TEXT, chart, colour, drawable, figure, frame, heat, legend, on, scale, short, span,
+    text,
 };
 use crate::exact::grid::ExactGrid;
 use crate::experiment::exhibits::WorldExhibit;
@@ -32,14 +33,15 @@ fn over_seeds(seeds: &[Vec<(f64, f64)>]) -> Vec<Band> {
     let longest = seeds.iter().map(Vec::len).max().unwrap_or_default();
     (0..longest)
         .filter_map(|place| {
-            let here: Vec<(f64, f64)> =
-                seeds.iter().filter_map(|seed| seed.get(place).copied()).collect();
-            let values = || here.iter().map(|(_, y)| *y).filter(|y| y.is_finite());
-            let count = values().count();
-            (count > 0).then(|| Band {
+            let here: Vec<(f64, f64)> = (seeds.iter())
+                .filter_map(|seed| seed.get(place).copied())
+                .filter(|(x, y)| drawable(*x) && drawable(*y))
+                .collect();
+            let values = || here.iter().map(|(_, y)| *y);
+            (!here.is_empty()).then(|| Band {
                 x: here[0].0,
                 low: values().fold(f64::INFINITY, f64::min),
-                middle: values().sum::<f64>() / count as f64,
+                middle: values().sum::<f64>() / here.len() as f64,
                 high: values().fold(f64::NEG_INFINITY, f64::max),
             })
         })
@@ -53,9 +55,14 @@ fn bands(
     (x_title, y_title): (&'static str, &'static str),
     dashed: &[Vec<(f64, f64)>],
 ) -> Option<String> {
+    if bands.iter().all(Vec::is_empty) {
+        return None;
+    }
     let all = || bands.iter().flatten();
-    let x = span(all().map(|band| band.x))?;
-    let y = span(all().flat_map(|band| [band.low, band.high]))?;
+    let others = || dashed.iter().flatten();
+    let x = span(all().map(|band| band.x).chain(others().map(|(x, _)| *x)))?;
+    let ends = all().flat_map(|band| [band.low, band.high]);
+    let y = span(ends.chain(others().map(|(_, y)| *y)))?;
     figure((1380, 760), |canvas| {
         let (top, below) = canvas.split_vertically(46);
         let words: Vec<_> = (panels.iter().enumerate().zip(bands))
@@ -170,7 +177,7 @@ fn optima(config: &GridConfig, gamma: f64, greatest: f64, alpha: f64) -> Vec<(f6
         let law = exact.optimum(budget(step)).ok()?.evaluation.law;
         Some((law.cvar(alpha), law.mean()))
     };
-    (0..=OPTIMA).filter_map(point).collect()
+    (0..=OPTIMA).filter_map(point).filter(|(x, y)| drawable(*x) && drawable(*y)).collect()
 }
 
 pub(super) fn frontier(
@@ -190,7 +197,8 @@ pub(super) fn frontier(
             let of_panel = |(place, panel): (usize, &Panel)| {
                 let level = panel.group.level(alpha);
                 let point = |measures: &crate::report::group::Measures| {
-                    Some((place, measures.cvar[level]?, measures.mean?))
+                    let (x, y) = (measures.cvar[level]?, measures.mean?);
+                    (drawable(x) && drawable(y)).then_some((place, x, y))
                 };
                 panel.group.measures.iter().filter_map(point).collect::<Vec<_>>()
             };

@@ -18,6 +18,9 @@ const MARGIN: (i32, i32) = (24, 60);
 /// Height of the strip with the colours' scale.
 const STRIP: i32 = 70;
 
+/// Larger maps are not drawn.
+const MOST_CELLS: usize = 10_000;
+
 /// Cells with fewer steps say nothing about a probability (the paper's threshold).
 const LEAST_VISITS: f64 = 500.0;
 /// The same for a mean of noise: its standard error is then below 0.1.
@@ -49,9 +52,15 @@ impl Layout {
     }
 }
 
-/// A place in a map.
+/// A place in a map, or far outside of it.
 fn at(origin: (i32, i32), x: f64, y: f64) -> (i32, i32) {
-    (origin.0 + (x * UNIT).round() as i32, origin.1 + (y * UNIT).round() as i32)
+    let units = |length: f64| (length * UNIT).round().clamp(-1e6, 1e6) as i32;
+    (origin.0 + units(x), origin.1 + units(y))
+}
+
+/// The world of a grid, if it is small enough for its cells to be seen.
+fn visible(config: &GridConfig) -> Option<LavaGrid> {
+    LavaGrid::new(config, 1).ok().filter(|grid| grid.cells() <= MOST_CELLS)
 }
 
 fn title(canvas: &Area, origin: (i32, i32), words: &str, colour: RGBColor) -> Drawn {
@@ -111,7 +120,7 @@ fn whole(grid: &LavaGrid) -> (f64, f64) {
 }
 
 pub(super) fn grid(config: &GridConfig) -> Option<(String, String)> {
-    let grid = LavaGrid::new(config, 1).ok()?;
+    let grid = visible(config)?;
     let layout = Layout { columns: 1, rows: 1, extent: whole(&grid), strip: 0 };
     let svg = figure(layout.size(), |canvas| {
         let origin = layout.origin(0, 0);
@@ -139,7 +148,7 @@ fn of_grid<'a>(panel: &'a Panel) -> impl Iterator<Item = &'a GridExhibit> {
 }
 
 pub(super) fn occupancy(config: &GridConfig, panels: &[Panel]) -> Option<(String, String)> {
-    let grid = LavaGrid::new(config, 1).ok()?;
+    let grid = visible(config)?;
     let mean = |panel: &Panel| -> Option<Vec<Option<f64>>> {
         let count = of_grid(panel).count() as f64;
         let sum = |cell: usize| of_grid(panel).filter_map(|of| of.occupancy.get(cell)).sum::<f64>();
@@ -172,7 +181,7 @@ fn strip(canvas: &Area, layout: &Layout, title: &str, ends: [String; 2]) -> Draw
 }
 
 pub(super) fn deviations(config: &GridConfig, panels: &[Panel]) -> Option<(String, String)> {
-    let grid = LavaGrid::new(config, 1).ok()?;
+    let grid = visible(config)?;
     let pooled = |panel: &Panel, of: fn(&GridExhibit) -> Option<&Deviations>| {
         let seeds: Vec<&Deviations> = of_grid(panel).filter_map(of).collect();
         let sum = |cell: usize, of: fn(&Deviations) -> &Vec<f64>| {
@@ -284,7 +293,7 @@ fn pooled(panel: &Panel, class: usize) -> Option<ShiftMap> {
     };
     for bin in 0..bins {
         let seeds = || seeds.iter().filter(|seed| seed.visits.get(bin).is_some_and(|n| *n > 0));
-        let visits: u64 = seeds().map(|seed| seed.visits[bin]).sum();
+        let visits = seeds().map(|seed| seed.visits[bin]).fold(0, u64::saturating_add);
         let mean = |of: &dyn Fn(&ShiftMap) -> f64| {
             seeds().map(|seed| seed.visits[bin] as f64 * of(seed)).sum::<f64>()
                 / visits.max(1) as f64
@@ -358,7 +367,7 @@ fn shift_map(
     greatest: f64,
 ) -> Drawn {
     let side = 1.0 / BINS_PER_METRE;
-    for bin in 0..(width * height).min(map.visits.len()) {
+    for bin in 0..width.saturating_mul(height).min(map.visits.len()) {
         if map.visits[bin] < LEAST_STEPS {
             continue;
         }
