@@ -253,10 +253,14 @@ fn the_quick_sweep_with_a_task_that_is_killed_and_requeued_ends_in_the_table_of_
     let task = format!("{}_0", sweep.submit());
     let checkpoint = sweep.folder(0).join("checkpoint-10.bin");
     cluster.until("a checkpoint", || checkpoint.exists());
-    // Script and program at once, so that nobody has time to say or save anything.
-    succeed(cluster.command("scancel").args(["--full", "--signal=KILL", &task]));
+    // Slurm itself would ask before it kills; the program and its worker have no time to save anything.
+    let cluster_name = cluster.folder.path().file_name().unwrap().to_str().unwrap();
+    let run = sweep.folder(0).strip_prefix(&sweep.out).unwrap().display().to_string();
+    let processes = format!("{cluster_name}/.*{run}");
+    succeed(Command::new("pkill").args(["-KILL", "-f", &processes]));
     let state = || cluster.ask("squeue", &["-h", "-j", &task, "-o", "%T"]);
     cluster.until("the task's end", || !["RUNNING\n", "COMPLETING\n"].contains(&&*state()));
+    assert!(!sweep.log(&task).contains("the same command goes on"), "{}", sweep.log(&task));
     assert!(!sweep.folder(0).join("evaluation.json").exists());
     succeed(cluster.command("scontrol").args(["requeue", &task]));
     // It stands in the queue behind all others.
