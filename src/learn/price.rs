@@ -124,13 +124,13 @@ mod tests {
         }
         let law = perturbation(parameters, budget);
         let richer = perturbation(parameters, budget * 1e-6f64.exp());
-        for outcome in 0..4 {
+        for (outcome, reward) in REWARDS.into_iter().enumerate() {
             let mut by_logits = [0.0; 4];
             let ratio = law.score(outcome, &mut by_logits);
             let score = std::array::from_fn(|i| by_logits[i / 2] * [1.0, budget.ln()][i % 2]);
             let mut path = so_far.clone();
             path.probability *= LAW.probabilities[outcome] * ratio;
-            path.rewards.push(REWARDS[outcome]);
+            path.rewards.push(reward);
             path.elasticities.push((richer.likelihood_ratio(outcome) / ratio).ln() / 1e-6);
             path.scores.push(score);
             paths(parameters, (budget / ratio).max(1.0), &path, all);
