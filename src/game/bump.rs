@@ -98,7 +98,7 @@ impl Bump {
         self.log_supremum
     }
 
-    /// log|I+K|, by which the reweighted law's entropy falls, times 1/2.
+    /// log|I+K|: the entropy of the reweighted law is lower than the nominal one's by half of it.
     pub fn log_determinant(&self) -> f64 {
         -self.covariance.determinant().ln()
     }
