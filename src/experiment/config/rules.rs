@@ -5,6 +5,7 @@
 
 use super::layers::{canonical, leaves};
 use super::{ConfigError, Device, WorldName};
+use crate::game::gaussian::MAX_BUMPS;
 use std::ops::Bound::{self, Excluded, Included, Unbounded};
 use toml::{Table, Value};
 
@@ -72,7 +73,7 @@ const RULES: &[(&str, Rule)] = &[
     ("train.PLAYER.entropy_final", NOT_NEGATIVE),
     ("train.PLAYER.value_coefficient", NOT_NEGATIVE),
     ("train.PLAYER.gradient_norm", POSITIVE),
-    ("train.bump.count", Whole(1, 3)),
+    ("train.bump.count", Whole(1, MAX_BUMPS as i64)),
     ("train.bump.center", Number(Excluded(0.0), Included(100.0))),
     ("train.bump.curvature", Number(Excluded(0.0), Included(1e6))),
     ("checkpoint.every", COUNT),
