@@ -282,8 +282,8 @@ pub enum Antagonist {
 ///
 /// lava-grid is solved exactly. On lava-point a near-optimal controller is computed on a lattice and
 /// played in the physical world, which takes minutes; what it attains there is a lower bound on the
-/// best CVaR. The certificates of the default world at eta 1, 25 and 100 come with the program; others
-/// are kept in $XDG_CACHE_HOME/cvar-game/oracle, by default under ~/.cache.
+/// best CVaR. The certificates of the default world at eta 1, 2, 5, 10, 25, 50 and 100 come with the
+/// program; others are kept in $XDG_CACHE_HOME/cvar-game/oracle, by default under ~/.cache.
 #[derive(Debug, Args)]
 #[command(after_help = "\
 Examples:

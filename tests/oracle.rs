@@ -242,7 +242,16 @@ fn certificates_are_kept_under_all_constants() {
 #[test]
 fn the_default_world_has_shipped_certificates() {
     let (config, effort) = (PointConfig::default(), Effort::default());
-    for (eta, promised) in [(1.0, 0.35), (25.0, 0.06), (100.0, -0.03)] {
+    let etas = [
+        (1.0, 0.35),
+        (2.0, 0.28),
+        (5.0, 0.2),
+        (10.0, 0.15),
+        (25.0, 0.06),
+        (50.0, 0.03),
+        (100.0, -0.03),
+    ];
+    for (eta, promised) in etas {
         let certified = shipped(&config, 1.0, eta, &effort).expect("it is shipped");
         assert_eq!((certified.eta, certified.lattice), (eta, effort.lattice));
         assert!(certified.certified_cvar_lo >= promised, "eta {eta}: {certified}");
