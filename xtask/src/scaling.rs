@@ -23,7 +23,7 @@ struct Axis {
 }
 
 /// An update every 10,000 environment steps, whatever the number of parallel episodes.
-const STEPS: u64 = 300_000;
+const STEPS: u64 = 600_000;
 
 const AXES: [Axis; 3] = [
     Axis {
@@ -188,25 +188,29 @@ fn draw(path: &Path, speeds: &[f64]) -> Result<()> {
     area.fill(&WHITE)?;
     let top = speeds.iter().copied().fold(0.0, f64::max) * 1.1 / 1e3;
     for (panel, axis) in area.split_evenly((1, AXES.len())).iter().zip(&AXES) {
-        let (first, last) = (axis.values[0] as f64, *axis.values.last().unwrap_or(&1) as f64);
+        // The values double or quadruple: equal distances are a logarithmic axis whose marks are theirs.
+        let last = axis.values.len() as f64 - 1.0;
         let mut chart = ChartBuilder::on(panel)
             .caption(axis.name, ("sans-serif", 18))
             .margin(10)
             .x_label_area_size(30)
-            .y_label_area_size(48)
-            .build_cartesian_2d((first / 1.2..last * 1.2).log_scale(), 0.0..top)?;
+            .y_label_area_size(64)
+            .build_cartesian_2d(-0.3..last + 0.3, 0.0..top)?;
         chart
             .configure_mesh()
             .disable_x_mesh()
+            .max_light_lines(0)
             .label_style(("sans-serif", 14))
             .y_desc("thousand steps per second")
-            .x_labels(4)
-            .x_label_formatter(&|x| format!("{x:.0}"))
+            .y_label_formatter(&|y| format!("{y:.0}"))
+            .x_labels(axis.values.len())
+            .x_label_formatter(&|&x| axis.values[x.round() as usize].to_string())
             .draw()?;
         for (world, colour) in WORLDS.into_iter().zip(colours) {
             let points: Vec<(f64, f64)> = rows(speeds)
                 .filter(|row| row.0 == world && row.1.name == axis.name)
-                .map(|(_, _, value, speed)| (value as f64, speed / 1e3))
+                .enumerate()
+                .map(|(place, (.., speed))| (place as f64, speed / 1e3))
                 .collect();
             chart
                 .draw_series(LineSeries::new(points.clone(), colour.stroke_width(2)).point_size(3))?
@@ -221,4 +225,24 @@ fn draw(path: &Path, speeds: &[f64]) -> Result<()> {
     }
     area.present()?;
     Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_size_has_its_mark_and_its_point() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("scaling.svg");
+        let sizes = AXES.iter().map(|axis| axis.values.len()).sum::<usize>();
+        let speeds: Vec<f64> = (0..WORLDS.len() * sizes).map(|i| 1e5 + 1e4 * i as f64).collect();
+        draw(&path, &speeds).unwrap();
+        let svg = std::fs::read_to_string(path).unwrap();
+        for value in AXES.iter().flat_map(|axis| axis.values) {
+            assert!(svg.contains(&format!("\n{value}\n")), "no mark at {value}");
+        }
+        assert_eq!(svg.matches("<circle").count(), speeds.len());
+        assert_eq!(csv(&speeds).lines().count(), 1 + speeds.len());
+    }
 }
