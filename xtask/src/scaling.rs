@@ -151,7 +151,8 @@ fn document(speeds: &[f64], gain: f64) -> String {
         "# What training costs\n\nEnvironment steps per second of one run on one core, eta = 25, \
          {STEPS} steps; medians of {REPEATS} runs, in an order that alternates between the sizes. All \
          else is as in `configs/default.toml` (250 parallel episodes, 64 hidden units, T = 40). Made by \
-         `cargo xtask scaling` on a machine that did nothing else; compare within this page alone.\n\n\
+         `cargo xtask scaling` on a machine that did nothing else. The default size stands in all three \
+         tables: how far its numbers differ is the noise of the machine.\n\n\
          ![steps per second against the sizes](scaling.svg)\n"
     );
     for axis in &AXES {
