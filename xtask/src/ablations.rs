@@ -42,7 +42,8 @@ const ABLATIONS: [Ablation; 19] = [
     Ablation("point-etas", POINT, "[2, 5, 10, 50]", &[]),
 ];
 
-/// Runs the sweeps that are not there yet, or one of them, and compares all with `results/paper`.
+/// Runs the sweeps that are not there yet, or one of them, and compares all, and the paper's plain settings,
+/// with `results/paper`.
 pub fn run(repository: &Path, target: &Path, only: Option<&str>) -> Result<ExitCode> {
     let program = target.join("release/cvar-game");
     let program = || {
@@ -79,8 +80,8 @@ pub fn run(repository: &Path, target: &Path, only: Option<&str>) -> Result<ExitC
     }
     let mut command = program();
     command.args(["table", "results/paper"]);
-    for Ablation(name, ..) in ABLATIONS {
-        let folder = format!("results/ablations/{name}");
+    let ablations = ABLATIONS.map(|Ablation(name, ..)| format!("results/ablations/{name}"));
+    for folder in std::iter::once("results/paper-plain".to_owned()).chain(ablations) {
         if repository.join(&folder).is_dir() {
             command.args(["--compare", &folder]);
         }
