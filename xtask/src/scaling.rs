@@ -22,7 +22,7 @@ struct Axis {
     options: fn(u64) -> Vec<String>,
 }
 
-/// An update every 10,000 environment steps, whatever the number of parallel episodes.
+/// Environment steps of a run.
 const STEPS: u64 = 600_000;
 
 const AXES: [Axis; 3] = [
@@ -149,11 +149,12 @@ fn csv(speeds: &[f64]) -> String {
 fn document(speeds: &[f64], gain: f64) -> String {
     let mut text = format!(
         "# What training costs\n\nEnvironment steps per second of one run on one core, eta = 25, \
-         {STEPS} steps; medians of {REPEATS} runs, in an order that alternates between the sizes. All \
+         {} thousand steps; medians of {REPEATS} runs, in an order that alternates between the sizes. All \
          else is as in `configs/default.toml` (250 parallel episodes, 64 hidden units, T = 40). Made by \
-         `cargo xtask scaling` on a machine that did nothing else. The default size stands in all three \
-         tables: how far its numbers differ is the noise of the machine.\n\n\
-         ![steps per second against the sizes](scaling.svg)\n"
+         `cargo xtask scaling`, which wants a machine that does nothing else. The default size stands in all \
+         three tables: how far its numbers differ is the noise of the machine.\n\n\
+         ![steps per second against the sizes](scaling.svg)\n",
+        STEPS / 1_000
     );
     for axis in &AXES {
         let _ = write!(text, "\n## {}\n\nIn {}.\n\n| |", capital(axis.name), axis.unit);
@@ -237,11 +238,14 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("scaling.svg");
         let sizes = AXES.iter().map(|axis| axis.values.len()).sum::<usize>();
-        let speeds: Vec<f64> = (0..WORLDS.len() * sizes).map(|i| 1e5 + 1e4 * i as f64).collect();
+        let speeds: Vec<f64> = (0..WORLDS.len() * sizes).map(|i| 7e5 + 1e3 * i as f64).collect();
         draw(&path, &speeds).unwrap();
         let svg = std::fs::read_to_string(path).unwrap();
-        for value in AXES.iter().flat_map(|axis| axis.values) {
-            assert!(svg.contains(&format!("\n{value}\n")), "no mark at {value}");
+        // The marks of the speeds are hundreds up to 700, none of the sizes.
+        let all = || AXES.iter().flat_map(|axis| axis.values);
+        for value in all() {
+            let axes = all().filter(|&other| other == value).count();
+            assert_eq!(svg.matches(&format!("\n{value}\n")).count(), axes, "marks at {value}");
         }
         assert_eq!(svg.matches("<circle").count(), speeds.len());
         assert_eq!(csv(&speeds).lines().count(), 1 + speeds.len());
