@@ -9,5 +9,5 @@ pub mod exact;
 pub mod experiment;
 pub mod files;
 pub mod game;
-pub mod options;
+pub mod learn;
 pub mod report;

@@ -1,10 +1,14 @@
-//! The command line program. It is not linked to libtorch, whose loading takes a third of a second:
-//! what needs the networks is handed over to `cvar-game-torch` beside it.
+//! The command line program.
 
-use clap::Parser;
-use cvar_game::cli;
+use cvar_game::{cli, experiment::registry};
 use std::process::ExitCode;
 
+/// libtorch allocates a tensor per operation. `override` makes the libraries use this allocator as
+/// well.
+#[cfg(feature = "torch")]
+#[global_allocator]
+static ALLOCATOR: mimalloc::MiMalloc = mimalloc::MiMalloc;
+
 fn main() -> ExitCode {
-    cli::tell(cli::run(cli::Cli::parse()))
+    cli::main(registry::standard())
 }

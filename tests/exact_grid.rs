@@ -1,23 +1,30 @@
 //! The yardsticks on `lava-grid`: against the real world, and their values on the paper's map.
 
-use cvar_game::exact::grid::{ExactGrid, solve};
+use cvar_game::exact::ExactError;
+use cvar_game::exact::finite::{ExactWorld, Summary};
 use cvar_game::exact::law::evaluate;
 use cvar_game::exact::policy::Policy;
 use cvar_game::game::returns::{Atom, ReturnLaw};
 use lava_envs::law::{FiniteLaw, sample_index};
 use lava_envs::random::{Purpose, stream};
-use lava_envs::{End, GridConfig, LavaGrid, Law, Move, Step, World};
+use lava_envs::{Discrete, End, FiniteModel, GridConfig, LavaGrid, Law, Move, Step, World};
 use proptest::prelude::*;
+
+type ExactGrid = ExactWorld<LavaGrid>;
+
+fn solve(config: &GridConfig, gamma: f64, eta: f64) -> Result<Summary, ExactError> {
+    ExactGrid::new(config, gamma)?.solve(eta)
+}
 
 /// Plays episodes in the world itself. `perturb(time, cell, action, law)` is the antagonist.
 fn simulate(
     exact: &ExactGrid,
     policy: &Policy,
     episodes: usize,
-    perturb: impl Fn(u32, usize, Move, FiniteLaw) -> FiniteLaw,
+    perturb: impl Fn(u32, usize, Move, FiniteLaw<4>) -> FiniteLaw<4>,
 ) -> ReturnLaw {
     const SLOTS: usize = 1000;
-    let mut world = LavaGrid::new(exact.grid().config(), SLOTS).unwrap();
+    let mut world = LavaGrid::new(exact.world().constants(), SLOTS).unwrap();
     let mut random = stream(1, Purpose::EvaluationOutcomes, 0);
     let mut steps = vec![Step::IDLE; SLOTS];
     let mut actions = vec![Move::Up; SLOTS];
@@ -248,7 +255,7 @@ fn exposure_to_the_worst_case_is_what_played_episodes_meet() {
     let eta: f64 = 25.0;
     let worst = exact.worst_case(&policy, eta).unwrap();
     let exposure = exact.exposure(&policy, &worst);
-    let cells = exact.grid().cells();
+    let cells = exact.world().cells();
     let counted =
         std::cell::RefCell::new((vec![0.0; cells], vec![0.0; cells], vec![(0.0, 0.0); 40]));
     let episodes = 50_000;

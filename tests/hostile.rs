@@ -5,12 +5,13 @@
 mod fuzz;
 
 use cap::Cap;
+use cvar_game::experiment::archive;
 use cvar_game::experiment::artefacts::{Evaluation, SCHEMA};
-use cvar_game::experiment::config::{Config, DEFAULT, RunConfig, Setting};
-use cvar_game::experiment::exhibits::Exhibits;
+use cvar_game::experiment::config::{Config, RunConfig, Setting, Source};
+use cvar_game::experiment::figure_data::FigureData;
 use cvar_game::experiment::names::RunId;
+use cvar_game::experiment::registry::standard;
 use cvar_game::experiment::{plan, runner};
-use cvar_game::report::group::groups;
 use cvar_game::report::runs::Runs;
 use cvar_game::report::table::{Results, Table};
 use cvar_game::report::{self, figures, page};
@@ -33,8 +34,9 @@ fuzz::fuzz_targets!(
     names,
     evaluations,
     episodes,
+    archives,
     progress,
-    exhibits,
+    figure_data,
     constants
 );
 
@@ -46,9 +48,15 @@ fn with_file(name: &str, bytes: &[u8], read: impl FnOnce(&Path)) {
     read(&path);
 }
 
+/// Whether a run's folder is below the output folder, by plain names alone.
+fn stays_in(folder: &Path, out: &Path) -> bool {
+    let names = folder.strip_prefix(out).map(|rest| rest.components());
+    names.is_ok_and(|mut names| names.all(|of| matches!(of, std::path::Component::Normal(_))))
+}
+
 fn first_run() -> RunConfig {
-    let config = Config::resolve(None, &[]).unwrap();
-    config.run(plan::runs(&config)[0])
+    let config = Config::resolve(standard().catalogue(), Source::Default, &[]).unwrap();
+    config.run(&plan::runs(&config)[0])
 }
 
 fn configs(effort: (u32, Duration)) -> u64 {
@@ -56,22 +64,30 @@ fn configs(effort: (u32, Duration)) -> u64 {
         fs::read(Path::new(env!("CARGO_MANIFEST_DIR")).join("configs").join(name)).unwrap()
     };
     let valid = vec![
-        DEFAULT.into(),
+        standard().catalogue().annotated_default().into(),
         shipped("quick.toml"),
         shipped("paper.toml"),
         b"train.steps = 20_000\n[env.lava-grid]\nslip = 0.1\n".into(),
+        b"[[experiment.variant]]\nname = \"k-1\"\netas = [25]\nset = { \"train.follower_updates\" = 1 }\n\
+          [experiment.axes]\n\"env.slip\" = [0.1, 0.2]\n\"train.leader\" = [\"antagonist\"]\n".into(),
+        b"extends = \"some.toml\"\ngamma = 0.9\n".into(),
     ];
     fuzz(&inputs(valid, "configs"), effort, |bytes| {
-        with_file("some.toml", bytes, |path| match Config::resolve(Some(path), &[]) {
-            // What is accepted can be printed and planned, and its runs stay in their folder.
-            Ok(config) => {
-                let _ = config.to_toml();
-                for id in plan::runs(&config) {
-                    let folder = id.folder(Path::new("out"));
-                    assert!(folder.starts_with("out") && folder.components().count() == 4);
+        with_file("some.toml", bytes, |path| {
+            match Config::resolve(standard().catalogue(), Source::File(path), &[]) {
+                // What is accepted can be printed and planned, and its runs stay in their folder.
+                Ok(config) => {
+                    let _ = config.to_toml();
+                    for id in plan::runs(&config) {
+                        let folder = id.folder(Path::new("out"));
+                        assert!(
+                            folder.starts_with("out")
+                                && [5, 6].contains(&folder.components().count())
+                        );
+                    }
                 }
+                Err(error) => assert!(!error.to_string().contains('\n'), "{error}"),
             }
-            Err(error) => assert!(!error.to_string().contains('\n'), "{error}"),
         });
     })
 }
@@ -80,7 +96,7 @@ fn run_configs(effort: (u32, Duration)) -> u64 {
     let valid = vec![first_run().to_toml().into()];
     fuzz(&inputs(valid, "run_configs"), effort, |bytes| {
         with_file("config.toml", bytes, |path| {
-            if let Ok(run) = RunConfig::load(path) {
+            if let Ok(run) = RunConfig::load(path, standard().catalogue()) {
                 let _ = run.differences(&first_run());
             }
         });
@@ -91,13 +107,14 @@ fn settings(effort: (u32, Duration)) -> u64 {
     let valid = vec![b"env.slip=0.1".into(), b"experiment.seeds=[1, 2]".into(), b"a=\"b\"".into()];
     fuzz(&inputs(valid, "settings"), effort, |bytes| {
         if let Ok(setting) = Setting::parse(&String::from_utf8_lossy(bytes)) {
-            let _ = Config::resolve(None, &[setting]);
+            let _ = Config::resolve(standard().catalogue(), Source::Default, &[setting]);
         }
     })
 }
 
 fn maps(effort: (u32, Duration)) -> u64 {
-    let valid = vec![lava_envs::grid::PAPER_MAP.into(), b"  S#G\n  .L.\n".into(), b"SG".into()];
+    let valid =
+        vec![lava_envs::GridConfig::default().map.into(), b"  S#G\n  .L.\n".into(), b"SG".into()];
     fuzz(&inputs(valid, "maps"), effort, |bytes| {
         if let Ok(map) = Map::parse(&String::from_utf8_lossy(bytes)) {
             assert!(map.cells() <= MAX_CELLS);
@@ -107,10 +124,14 @@ fn maps(effort: (u32, Duration)) -> u64 {
 }
 
 fn names(effort: (u32, Duration)) -> u64 {
-    let valid = vec![b"lava-grid/eta-25/seed-3".into(), b"lava-point/eta-2.5/seed-0".into()];
+    let valid = vec![
+        b"lava-grid/eta-25/seed-3".into(),
+        b"lava-point/game/eta-2.5/seed-0".into(),
+        b"lava-grid/game/k-1+noise-0.5/eta-25/seed-3".into(),
+    ];
     fuzz(&inputs(valid, "names"), effort, |bytes| {
         if let Ok(id) = String::from_utf8_lossy(bytes).parse::<RunId>() {
-            assert_eq!(id.folder(Path::new("out")).components().count(), 4, "{id}");
+            assert!(stays_in(&id.folder(Path::new("out")), Path::new("out")), "{id}");
         }
     })
 }
@@ -186,11 +207,36 @@ fn episodes(effort: (u32, Duration)) -> u64 {
     })
 }
 
+/// The archive of a results folder.
+fn archives(effort: (u32, Duration)) -> u64 {
+    let out = tempfile::tempdir().unwrap();
+    for name in ["lava-grid/eta-25/seed-1", "lava-point/game/k-1/eta-25/seed-1"] {
+        let folder = out.path().join(name);
+        fs::create_dir_all(&folder).unwrap();
+        let world = name.split('/').next().unwrap();
+        fs::write(folder.join("evaluation.json"), evaluation(world)).unwrap();
+        fs::write(folder.join("config.toml"), first_run().to_toml()).unwrap();
+    }
+    assert_eq!(archive::pack(out.path(), false).unwrap().runs, 2);
+    let valid = vec![fs::read(out.path().join("runs.zip")).unwrap()];
+    fuzz(&inputs(valid, "archives"), effort, |bytes| {
+        let parent = tempfile::tempdir().unwrap();
+        let out = parent.path().join("out");
+        fs::create_dir(&out).unwrap();
+        fs::write(out.join("runs.zip"), bytes).unwrap();
+        let _ = runner::read_evaluation(&out.join("lava-grid/eta-25/seed-1"));
+        if report::write(&out).is_ok() {
+            report::table_json(&out, &[]).unwrap();
+        }
+        assert_eq!(fs::read_dir(&parent).unwrap().count(), 1, "it has left its folder");
+    })
+}
+
 const PROGRESS: &str =
     "steps,player,mean_return,regret\n10000,protagonist,-1.5,1.5\n20000,antagonist,NaN,\n";
 
-/// The `exhibits.json` of a run in a small world.
-fn exhibits_of(env: &str) -> String {
+/// The `figure_data.json` of a run in a small world.
+fn figure_data_of(env: &str) -> String {
     let maps = serde_json::json!({
         "visits": [900.0, 900.0, 900.0, 0.0], "deviations": [90.0, 9.0, 0.0, 0.0],
     });
@@ -213,12 +259,12 @@ fn exhibits_of(env: &str) -> String {
         "path": [[0.0, 0.0], [1.0, 0.5]], "actions": [[0.0, 1.0]], "outcomes": [[1.0, 0.0]],
         "ratios": [2.0], "budgets": [25.0, 12.5],
     });
-    let exhibits = serde_json::json!({
+    let data = serde_json::json!({
         "schema": SCHEMA, "episodes": 1000, "world": world, "stored": [episode],
         "budget": {"running": [9, 8], "mean": [1.0, 0.4], "low": [1.0, 0.1], "high": [1.0, 0.8]},
     });
-    let text = exhibits.to_string();
-    serde_json::from_str::<Exhibits>(&text).unwrap().check().unwrap();
+    let text = data.to_string();
+    serde_json::from_str::<FigureData>(&text).unwrap().check().unwrap();
     text
 }
 
@@ -227,33 +273,36 @@ fn drawn(corpus: &str, file: &str, valid: Vec<Vec<u8>>, effort: (u32, Duration))
     let out = tempfile::tempdir().unwrap();
     let sets = ["env.lava-grid.map=\"SG\\n.L\"", "env.lava-grid.horizon=4"];
     let sets = sets.map(|set| Setting::parse(set).unwrap());
-    let config = Config::resolve(None, &sets).unwrap();
+    let config = Config::resolve(standard().catalogue(), Source::Default, &sets).unwrap();
     let folders = ["lava-grid", "lava-point"].map(|env| {
         let id: RunId = format!("{env}/eta-25/seed-1").parse().unwrap();
         let folder = id.folder(out.path());
         fs::create_dir_all(&folder).unwrap();
-        fs::write(folder.join("config.toml"), config.run(id).to_toml()).unwrap();
+        fs::write(folder.join("config.toml"), config.run(&id).to_toml()).unwrap();
         fs::write(folder.join("evaluation.json"), evaluation(env)).unwrap();
-        fs::write(folder.join("exhibits.json"), exhibits_of(env)).unwrap();
+        fs::write(folder.join("figure_data.json"), figure_data_of(env)).unwrap();
         fs::write(folder.join("progress.csv"), PROGRESS).unwrap();
         folder
     });
     let runs = Runs::read(out.path()).unwrap();
-    let results = Results { name: "", runs: &runs, groups: groups(&runs) };
-    let results = std::slice::from_ref(&results);
-    let table = Table::new(results);
-    let undamaged = figures::draw(&results[0].groups).unwrap();
+    let results = Results::of(&[("results", &runs)]);
+    let table = Table::new(&results);
+    let draw = || {
+        let (panels, notes) = figures::panels(&results);
+        let figures = figures::draw(&panels, notes, standard());
+        (panels, figures)
+    };
+    let (_, undamaged) = draw();
     assert_eq!(undamaged.missing, Vec::<String>::new());
     fuzz(&inputs(valid, corpus), effort, |bytes| {
         for folder in &folders {
             fs::write(folder.join(file), bytes).unwrap();
         }
-        if let Ok(figures) = figures::draw(&results[0].groups) {
-            for figure in figures.drawn.iter().filter(|figure| !undamaged.drawn.contains(figure)) {
-                figures::png(&figure.svg).unwrap();
-            }
-            page::render("results", &table, &results[0].groups, &figures).unwrap();
+        let (panels, figures) = draw();
+        for figure in figures.drawn.iter().filter(|figure| !undamaged.drawn.contains(figure)) {
+            figures::png(&figure.picture.svg).unwrap();
         }
+        page::render("results", &table, &panels, &figures, standard());
     })
 }
 
@@ -266,9 +315,9 @@ fn progress(effort: (u32, Duration)) -> u64 {
     drawn("progress", "progress.csv", valid, effort)
 }
 
-fn exhibits(effort: (u32, Duration)) -> u64 {
-    let valid = ["lava-grid", "lava-point"].map(|env| exhibits_of(env).into());
-    drawn("exhibits", "exhibits.json", valid.into(), effort)
+fn figure_data(effort: (u32, Duration)) -> u64 {
+    let valid = ["lava-grid", "lava-point"].map(|env| figure_data_of(env).into());
+    drawn("figure_data", "figure_data.json", valid.into(), effort)
 }
 
 /// The constants of a world as figures read them from the `config.toml` of a run.
@@ -284,7 +333,9 @@ fn constants(effort: (u32, Duration)) -> u64 {
 fn sizes_beyond_reason_are_refused() {
     let refused = |sets: &[&str]| {
         let settings: Vec<Setting> = sets.iter().map(|set| Setting::parse(set).unwrap()).collect();
-        let message = Config::resolve(None, &settings).unwrap_err().to_string();
+        let message = Config::resolve(standard().catalogue(), Source::Default, &settings)
+            .unwrap_err()
+            .to_string();
         assert!(message.contains("at most") || message.contains("from 1 to"), "{message}");
     };
     refused(&["train.parallel_episodes=1000000000", "train.rollout_steps=1000000000"]);
@@ -297,9 +348,12 @@ fn sizes_beyond_reason_are_refused() {
     assert!(Map::parse(&map).unwrap_err().to_string().contains("draw a smaller map"));
     assert!(Setting::parse(&format!("{}=1", "a.".repeat(100_000) + "a")).is_err());
     with_file("deep.toml", format!("{} = 1", "a.".repeat(100_000) + "a").as_bytes(), |path| {
-        assert!(Config::resolve(Some(path), &[]).is_err());
+        assert!(Config::resolve(standard().catalogue(), Source::File(path), &[]).is_err());
     });
-    let endless = Config::resolve(Some(Path::new("/dev/zero")), &[]).unwrap_err().to_string();
+    let endless =
+        Config::resolve(standard().catalogue(), Source::File(Path::new("/dev/zero")), &[])
+            .unwrap_err()
+            .to_string();
     assert!(endless.contains("larger than"), "{endless}");
     let square = "<svg xmlns=\"http://www.w3.org/2000/svg\" width=\"50000\" height=\"50000\"/>";
     figures::png(square).unwrap();

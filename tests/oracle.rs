@@ -93,7 +93,7 @@ fn cubic_weights_reproduce_cubics() {
 /// One step of the real world from a place, with v+ fixed.
 fn real_step(world: &mut LavaPoint, position: [f64; 2], plus: [f64; 2]) -> Step {
     world.place(0, position, [0.0, 0.0]);
-    let noise = world.config().noise;
+    let noise = world.constants().noise;
     let mut steps = [Step::IDLE];
     let outcome = Vector2::from(plus) / noise;
     world.apply(&[Force(Vector2::zeros())], &[outcome], &mut steps);

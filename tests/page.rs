@@ -1,13 +1,15 @@
 //! Figures and page, from artefacts made up here; the page in a browser.
 
-use cvar_game::experiment::artefacts::{Chance, Evaluation, Mode, Play, SCHEMA};
+use cvar_game::experiment::artefacts::{Chance, Evaluation, Play, SCHEMA};
 use cvar_game::experiment::config::Config;
-use cvar_game::experiment::exhibits::{
-    BudgetByTime, Deviations, Exhibits, GridExhibit, PointExhibit, ShiftMap, StoredEpisode,
-    WorldExhibit,
+use cvar_game::experiment::config::Source;
+use cvar_game::experiment::figure_data::{
+    BudgetByTime, CellData, Deviations, FigureData, PlaneData, ShiftMap, StoredEpisode, WorldData,
 };
 use cvar_game::experiment::plan;
+use cvar_game::experiment::registry::standard;
 use cvar_game::game::returns::{Atom, ReturnLaw};
+use cvar_game::learn::policy::Mode;
 use cvar_game::report;
 use lava_envs::End;
 use std::fs;
@@ -18,11 +20,11 @@ use std::process::Command;
 fn results(dir: &Path) {
     let settings = ["experiment.etas=[1,25]", "experiment.seeds=[1,2]"]
         .map(|text| cvar_game::experiment::config::Setting::parse(text).unwrap());
-    let config = Config::resolve(None, &settings).unwrap();
+    let config = Config::resolve(standard().catalogue(), Source::Default, &settings).unwrap();
     for id in plan::runs(&config) {
         let folder = id.folder(dir);
         fs::create_dir_all(&folder).unwrap();
-        fs::write(folder.join("config.toml"), config.run(id).to_toml()).unwrap();
+        fs::write(folder.join("config.toml"), config.run(&id).to_toml()).unwrap();
         let progress = "steps,player,mean_return,regret\n10000,protagonist,-1.5,1.5\n20000,antagonist,0.25,0.25\n";
         fs::write(folder.join("progress.csv"), progress).unwrap();
         let law = || {
@@ -38,7 +40,7 @@ fn results(dir: &Path) {
             |protagonist, chance| Play { protagonist, chance, law: law(), mean_clearance: None };
         let evaluation = Evaluation {
             schema: SCHEMA,
-            env: id.env.to_string(),
+            env: id.world.to_string(),
             eta: id.eta.get(),
             seed: id.seed,
             steps: 20_000,
@@ -49,12 +51,13 @@ fn results(dir: &Path) {
         };
         let text = serde_json::to_string(&evaluation).unwrap();
         fs::write(folder.join("evaluation.json"), text).unwrap();
-        let text = serde_json::to_string(&exhibits(id.env.as_str(), id.eta.is_neutral())).unwrap();
-        fs::write(folder.join("exhibits.json"), text).unwrap();
+        let text =
+            serde_json::to_string(&figure_data(id.world.as_str(), id.eta.is_neutral())).unwrap();
+        fs::write(folder.join("figure_data.json"), text).unwrap();
     }
 }
 
-fn exhibits(env: &str, neutral: bool) -> Exhibits {
+fn figure_data(env: &str, neutral: bool) -> FigureData {
     let counts =
         |share: f64| Deviations { visits: vec![1000.0; 70], deviations: vec![1000.0 * share; 70] };
     let shifts = ShiftMap {
@@ -63,14 +66,14 @@ fn exhibits(env: &str, neutral: bool) -> Exhibits {
         divergence: vec![0.1; 280],
     };
     let world = if env == "lava-grid" {
-        WorldExhibit::LavaGrid(GridExhibit {
+        WorldData::Cells(CellData {
             occupancy: vec![0.5; 70],
             learned: (!neutral).then(|| counts(0.375)),
             exact: (!neutral).then(|| counts(0.625)),
             exact_budget: if neutral { Vec::new() } else { vec![1.0, 0.5] },
         })
     } else {
-        WorldExhibit::LavaPoint(PointExhibit {
+        WorldData::Plane(PlaneData {
             trajectories: vec![vec![[0.5, 0.5], [1.5, 3.0]]],
             bins: if neutral { [0, 0] } else { [20, 14] },
             shifts: if neutral { Vec::new() } else { vec![shifts; 3] },
@@ -89,7 +92,7 @@ fn exhibits(env: &str, neutral: bool) -> Exhibits {
     };
     let kinds =
         if neutral { vec![Chance::Nominal] } else { vec![Chance::Nominal, Chance::Antagonist] };
-    Exhibits {
+    FigureData {
         schema: SCHEMA,
         episodes: 1000,
         world,
@@ -107,7 +110,7 @@ fn exhibits(env: &str, neutral: bool) -> Exhibits {
 fn every_figure_is_drawn_as_svg_with_text_and_as_png() {
     let dir = tempfile::tempdir().unwrap();
     results(dir.path());
-    let written = report::write_all(dir.path()).unwrap();
+    let written = report::write_all(dir.path(), standard()).unwrap();
     assert_eq!(written.figures.missing, Vec::<String>::new());
     let names: Vec<&str> =
         written.figures.drawn.iter().map(|figure| figure.name.as_str()).collect();
@@ -125,6 +128,7 @@ fn every_figure_is_drawn_as_svg_with_text_and_as_png() {
             "lava-point-trajectories",
             "lava-point-shifts",
             "lava-point-frontier",
+            "lava-point-regret",
             "lava-point-cross",
             "lava-point-learning",
             "lava-point-budget",
@@ -132,16 +136,69 @@ fn every_figure_is_drawn_as_svg_with_text_and_as_png() {
     );
     for figure in &written.figures.drawn {
         let stem = dir.path().join("figures").join(&figure.name);
-        assert_eq!(fs::read_to_string(stem.with_extension("svg")).unwrap(), figure.svg);
-        assert!(figure.svg.contains("<text"), "{} has no text", figure.name);
+        assert_eq!(fs::read_to_string(stem.with_extension("svg")).unwrap(), figure.picture.svg);
+        assert!(figure.picture.svg.contains("<text"), "{} has no text", figure.name);
         let png = fs::read(stem.with_extension("png")).unwrap();
         assert!(png.starts_with(b"\x89PNG"), "{} is no PNG", figure.name);
     }
     let figure = |name| written.figures.drawn.iter().find(|figure| figure.name == name).unwrap();
     // The shares of both antagonists, which no axis can show by chance.
-    let deviations = &figure("lava-grid-deviations").svg;
+    let deviations = &figure("lava-grid-deviations").picture.svg;
     assert!(deviations.contains(".38") && deviations.contains(".62"), "{deviations}");
     assert!(figure("lava-grid-deviations").caption.contains("1000 trajectories"));
+}
+
+/// The committed figures are those of the committed archive.
+#[test]
+fn committed_results_make_their_figures_again() {
+    let results = Path::new(env!("CARGO_MANIFEST_DIR")).join("results/paper");
+    let dir = tempfile::tempdir().unwrap();
+    fs::copy(results.join("runs.zip"), dir.path().join("runs.zip")).unwrap();
+    let figures = report::write_figures(dir.path(), standard()).unwrap();
+    assert_eq!(figures.drawn.len(), fs::read_dir(results.join("figures")).unwrap().count() / 2);
+    for figure in &figures.drawn {
+        let file = format!("figures/{}.svg", figure.name);
+        let committed = fs::read_to_string(results.join(&file)).unwrap();
+        assert!(figure.picture.svg == committed, "results/paper/{file} differs");
+    }
+}
+
+/// A variant and a method with constants of its own: all are in the curves, and in the maps those that have
+/// the same world.
+#[test]
+fn figures_name_methods_and_variants() {
+    let dir = tempfile::tempdir().unwrap();
+    results(dir.path());
+    for (from, to) in
+        [("lava-grid/game", "lava-grid/game/k-1"), ("lava-point/game", "lava-point/mine")]
+    {
+        for seed in ["eta-25/seed-1", "eta-25/seed-2"] {
+            let (from, to) = (dir.path().join(from).join(seed), dir.path().join(to).join(seed));
+            fs::create_dir_all(&to).unwrap();
+            for entry in fs::read_dir(from).unwrap() {
+                let entry = entry.unwrap();
+                fs::copy(entry.path(), to.join(entry.file_name())).unwrap();
+            }
+        }
+    }
+    let other = dir.path().join("lava-point/mine/eta-25/seed-1/config.toml");
+    let text = fs::read_to_string(&other).unwrap().replace("noise = 1.5", "noise = 0.5");
+    assert!(text.contains("noise = 0.5"), "{text}");
+    fs::write(&other, text).unwrap();
+    let written = report::write_all(dir.path(), standard()).unwrap();
+    let svg = |name: &str| {
+        let drawn = written.figures.drawn.iter().find(|figure| figure.name == name);
+        &drawn.unwrap_or_else(|| panic!("{name} is missing")).picture.svg
+    };
+    for name in ["frontier", "cross", "learning", "occupancy", "deviations"] {
+        assert!(svg(&format!("lava-grid-{name}")).contains("game/k-1"), "{name}");
+    }
+    assert!(svg("lava-point-learning").contains("mine, eta = 25"));
+    assert!(!svg("lava-point-shifts").contains("mine"), "it has another world");
+    let missing = "lava-point: maps of mine, eta = 25, whose constants are not those of the others";
+    assert_eq!(written.figures.missing, [missing]);
+    let page = fs::read_to_string(dir.path().join("report.html")).unwrap();
+    assert!(page.contains("game/k-1, eta = 25 (2 seeds)"));
 }
 
 #[test]
@@ -149,7 +206,7 @@ fn the_same_artefacts_give_the_same_page() {
     let dir = tempfile::tempdir().unwrap();
     results(dir.path());
     let page = || {
-        report::write_all(dir.path()).unwrap();
+        report::write_all(dir.path(), standard()).unwrap();
         fs::read_to_string(dir.path().join("report.html")).unwrap()
     };
     let text = page();
@@ -161,20 +218,20 @@ fn the_same_artefacts_give_the_same_page() {
 
 /// Those of former versions and of other programs.
 #[test]
-fn runs_without_exhibits_report_all_the_same() {
+fn runs_without_figure_data_report_all_the_same() {
     let dir = tempfile::tempdir().unwrap();
     results(dir.path());
     for entry in ["lava-grid", "lava-point"] {
         for (eta, seed) in [(1, 1), (1, 2), (25, 1), (25, 2)] {
-            let folder = dir.path().join(format!("{entry}/eta-{eta}/seed-{seed}"));
-            fs::remove_file(folder.join("exhibits.json")).unwrap();
+            let folder = dir.path().join(format!("{entry}/game/eta-{eta}/seed-{seed}"));
+            fs::remove_file(folder.join("figure_data.json")).unwrap();
             if entry == "lava-point" {
                 fs::remove_file(folder.join("config.toml")).unwrap();
                 fs::remove_file(folder.join("progress.csv")).unwrap();
             }
         }
     }
-    let written = report::write_all(dir.path()).unwrap();
+    let written = report::write_all(dir.path(), standard()).unwrap();
     let drawn: Vec<&str> =
         written.figures.drawn.iter().map(|figure| figure.name.as_str()).collect();
     assert_eq!(
@@ -189,30 +246,39 @@ fn runs_without_exhibits_report_all_the_same() {
             "lava-point-cross",
         ]
     );
-    assert!(written.figures.missing.contains(&"lava-grid: where chance is bent".to_owned()));
+    assert!(
+        written
+            .figures
+            .missing
+            .contains(&"lava-grid: where the antagonist changes moves".to_owned())
+    );
     let page = fs::read_to_string(dir.path().join("report.html")).unwrap();
     assert!(page.contains("No episodes were stored.") && page.contains("Left out"), "{page}");
 }
 
+/// They are missing in the figures, and the page says so.
 #[test]
-fn damaged_exhibits_are_named() {
+fn damaged_figure_data_is_named_and_left_out() {
     for (spoil, said) in
         [("divergence", "maps are of unequal size"), ("ratios", "episode lacks a part")]
     {
         let dir = tempfile::tempdir().unwrap();
         results(dir.path());
-        let path = dir.path().join("lava-point/eta-25/seed-2/exhibits.json");
+        let path = dir.path().join("lava-point/game/eta-25/seed-2/figure_data.json");
         let mut value: serde_json::Value =
             serde_json::from_slice(&fs::read(&path).unwrap()).unwrap();
         let list = match spoil {
-            "divergence" => &mut value["world"]["lava-point"]["shifts"][1][spoil],
+            "divergence" => &mut value["world"]["plane"]["shifts"][1][spoil],
             _ => &mut value["stored"][0][spoil],
         };
         list.as_array_mut().unwrap().pop();
         fs::write(&path, value.to_string()).unwrap();
-        let error = report::write_all(dir.path()).unwrap_err().to_string();
-        assert!(error.contains("seed-2/exhibits.json") && error.contains(said), "{error}");
-        assert!(!dir.path().join("report.html").exists());
+        let written = report::write_all(dir.path(), standard()).unwrap();
+        let [note] = &written.figures.notes[..] else { panic!("{:?}", written.figures.notes) };
+        assert!(note.contains("seed-2/figure_data.json") && note.contains(said), "{note}");
+        assert_eq!(written.figures.drawn.len(), 15);
+        let page = fs::read_to_string(dir.path().join("report.html")).unwrap();
+        assert!(page.contains("Missing in the figures: ") && page.contains(said));
     }
 }
 
@@ -223,7 +289,7 @@ fn damaged_exhibits_are_named() {
 fn the_page_works_in_a_browser() {
     let dir = tempfile::tempdir().unwrap();
     results(dir.path());
-    report::write_all(dir.path()).unwrap();
+    report::write_all(dir.path(), standard()).unwrap();
     let page = fs::read_to_string(dir.path().join("report.html")).unwrap();
     let first = "<script>window.errors = []; window.onerror = (text) => errors.push(text); \
                  console.error = (...all) => errors.push(all.join(' '));</script>";
@@ -240,13 +306,13 @@ fn the_page_works_in_a_browser() {
         of("eta").dispatchEvent(new Event("change"));
         of("chance").value = "antagonist";
         of("chance").dispatchEvent(new Event("change"));
-        result.start = of("told").textContent;
+        result.start = of("step").textContent;
         of("play").click();
         setTimeout(() => {
-          result.end = of("told").textContent;
+          result.end = of("step").textContent;
           of("scrub").value = 1;
           of("scrub").dispatchEvent(new Event("input"));
-          result.scrubbed = of("told").textContent;
+          result.scrubbed = of("step").textContent;
           result.wide = document.documentElement.scrollWidth - document.documentElement.clientWidth;
           result.errors = errors;
           document.title = JSON.stringify(result);

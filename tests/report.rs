@@ -1,12 +1,14 @@
 //! Tables from synthetic results folders with known answers.
 
+use cvar_game::experiment::archive;
 use cvar_game::experiment::artefacts::{
-    Audit, Certificate, Chance, Evaluation, Manifest, Mode, Play, SCHEMA,
+    Audit, Certificate, Chance, Evaluation, Manifest, Play, SCHEMA,
 };
 use cvar_game::game::returns::{Atom, ReturnLaw};
+use cvar_game::learn::policy::Mode;
 use cvar_game::report::{self, ReportError};
 use lava_envs::End;
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
 use std::path::{Path, PathBuf};
 
@@ -68,7 +70,7 @@ fn manifest(dir: &Path, env: &str, eta: f64, seed: u64, failure: Option<&str>) {
         run: format!("{env}/eta-{eta}/seed-{seed}"),
         version: "0.1.0".to_owned(),
         commit: None,
-        libtorch: "2.13.0".to_owned(),
+        libtorch: Some("2.13.0".to_owned()),
         device: "cpu".to_owned(),
         cpu: "a processor".to_owned(),
         seconds: 3.0,
@@ -377,7 +379,10 @@ fn a_leaking_or_violated_budget_is_shouted() {
     run.plays[3].law = recorded(&[(End::Lava, 4, 1000)]);
     store(dir.path(), &run);
     let terminal = report::write(dir.path()).unwrap();
-    assert!(terminal.contains("BUDGET VIOLATED: lava-grid/eta-25/seed-1, 3 times"), "{terminal}");
+    assert!(
+        terminal.contains("BUDGET VIOLATED: lava-grid/eta-25/seed-1, 3 violations"),
+        "{terminal}"
+    );
     assert!(terminal.contains("BUDGET LEAKS: lava-grid/eta-25/seed-1"), "{terminal}");
     assert_eq!(terminal.matches("BUDGET").count(), 2);
 }
@@ -396,15 +401,14 @@ fn json_has_every_row_and_says_null_where_there_is_no_number() {
     assert!(!dir.path().join("table.csv").exists(), "asking for JSON writes nothing");
 }
 
-fn refusal(spoil: impl FnOnce(&Path)) -> String {
+/// The report of a folder in which something is spoilt: what it says, and the number of its runs.
+fn spoilt(spoil: impl FnOnce(&Path)) -> (String, usize) {
     let dir = tempfile::tempdir().unwrap();
     realistic(dir.path());
     spoil(dir.path());
-    let error = report::write(dir.path()).unwrap_err();
-    assert!(!dir.path().join("runs.csv").exists(), "nothing is written after {error}");
-    let message = error.to_string();
-    assert_eq!(message.lines().count(), 1, "{message}");
-    message
+    let terminal = report::write(dir.path()).unwrap();
+    let text = terminal.split_whitespace().collect::<Vec<_>>().join(" ");
+    (text, csv(dir.path(), "runs.csv").len())
 }
 
 const VICTIM: &str = "lava-point/eta-25/seed-2/evaluation.json";
@@ -416,8 +420,9 @@ fn edit(dir: &Path, change: impl FnOnce(&mut serde_json::Value)) {
     fs::write(path, value.to_string()).unwrap();
 }
 
+/// A damaged file costs the row of its run, and no more.
 #[test]
-fn damaged_and_foreign_files_are_named() {
+fn damaged_and_foreign_files_are_named_and_left_out() {
     type Spoil = Box<dyn FnOnce(&Path)>;
     let cases: [(&str, Spoil); 9] = [
         (
@@ -467,16 +472,32 @@ fn damaged_and_foreign_files_are_named() {
         ),
     ];
     for (what, spoil) in cases {
-        let message = refusal(spoil);
-        assert!(message.contains(VICTIM) && message.contains(what), "{what}: {message}");
+        let (said, runs) = spoilt(spoil);
+        assert!(said.contains(VICTIM) && said.contains(what), "{what}: {said}");
+        assert!(said.contains("! LEFT OUT: lava-point/eta-25/seed-2."), "{said}");
+        assert_eq!(runs, 17, "{what}");
     }
-    let twice = refusal(|dir| {
-        let world = dir.join("lava-grid");
-        fs::create_dir_all(world.join("eta-25.0/seed-1")).unwrap();
-        let file = "seed-1/evaluation.json";
-        fs::copy(world.join("eta-25").join(file), world.join("eta-25.0").join(file)).unwrap();
+    let (said, runs) = spoilt(|dir| {
+        fs::write(dir.join("lava-grid/eta-1/seed-1/manifest.json"), "{").unwrap();
     });
-    assert!(twice.contains("two folders hold lava-grid/eta-25/seed-1"), "{twice}");
+    assert!(said.contains("lava-grid/eta-1/seed-1/manifest.json is damaged"), "{said}");
+    assert_eq!(runs, 17);
+}
+
+#[test]
+fn a_run_in_two_folders_is_refused() {
+    let dir = tempfile::tempdir().unwrap();
+    realistic(dir.path());
+    let world = dir.path().join("lava-grid");
+    for twin in ["eta-25.0/seed-1", "game/eta-25/seed-1"] {
+        fs::create_dir_all(world.join(twin)).unwrap();
+        let file = "evaluation.json";
+        fs::copy(world.join("eta-25/seed-1").join(file), world.join(twin).join(file)).unwrap();
+        let error = report::write(dir.path()).unwrap_err().to_string();
+        assert!(error.contains("two folders hold lava-grid/eta-25/seed-1"), "{error}");
+        assert!(!dir.path().join("runs.csv").exists(), "nothing is written after {error}");
+        fs::remove_dir_all(world.join(twin)).unwrap();
+    }
 }
 
 #[test]
@@ -484,12 +505,18 @@ fn a_folder_without_runs_says_what_is_expected() {
     let dir = tempfile::tempdir().unwrap();
     let error = report::write(dir.path()).unwrap_err();
     assert!(matches!(error, ReportError::NoRuns { .. }));
-    assert!(error.to_string().contains("ENV/eta-E/seed-N"), "{error}");
+    assert!(error.to_string().contains("WORLD/METHOD/eta-E/seed-N"), "{error}");
     folder(dir.path(), "lava-grid", 1.0, 1);
     let error = report::write(dir.path()).unwrap_err();
     assert!(error.to_string().contains("in progress"), "{error}");
     let error = report::write(&dir.path().join("nowhere")).unwrap_err();
     assert!(matches!(error, ReportError::Read { .. }) && error.to_string().contains("nowhere"));
+    // Of one damaged run nothing is left to report.
+    store(dir.path(), &evaluation("lava-grid", 1.0, 1, Vec::new()));
+    fs::write(dir.path().join("lava-grid/eta-1/seed-1/evaluation.json"), "{").unwrap();
+    let error = report::write(dir.path()).unwrap_err();
+    assert!(matches!(error, ReportError::Corrupt { .. }), "{error}");
+    assert_eq!(error.to_string().lines().count(), 1, "{error}");
 }
 
 /// The folder beside itself with three seeds worse and one method of another program.
@@ -521,14 +548,178 @@ fn folders_are_put_side_by_side() {
     );
     assert_eq!(first["versus"], "");
     assert_eq!(first["clearance"], "0.490000");
-    for said in ["against the first results folder", "0.920*", "0.520 "] {
+    for said in ["lava-point: against ours", "0.920*", "0.520 "] {
         assert!(terminal.contains(said), "{said} is not in\n{terminal}");
     }
     let latex = fs::read_to_string(ours.join("comparison.tex")).unwrap();
     assert!(latex.contains("\\textbf{0.920}") && !latex.contains("\\textbf{0.520}"), "{latex}");
     fs::write(theirs.join("lava-point/eta-2/seed-2/episodes.csv"), "return,steps\n1,2\n").unwrap();
-    let error = report::write_comparison(&ours, &[theirs]).unwrap_err().to_string();
-    assert!(error.contains("episodes.csv") && error.contains("missing field `end`"), "{error}");
+    let said = report::write_comparison(&ours, &[theirs]).unwrap();
+    let said = said.split_whitespace().collect::<Vec<_>>().join(" ");
+    assert!(said.contains("! theirs: LEFT OUT: lava-point/eta-2/seed-2."), "{said}");
+    assert!(said.contains("episodes.csv") && said.contains("missing field `end`"), "{said}");
+    assert_eq!(row(&csv(&ours, "comparison.csv"), &[("folder", "theirs")])["versus_pairs"], "2");
+}
+
+/// A folder with the method `game`, a variant of it and a method of another program.
+#[test]
+fn methods_and_variants_of_one_folder_are_compared() {
+    let dir = tempfile::tempdir().unwrap();
+    let names =
+        [("lava-point", [1, 2]), ("lava-point/game/k-1", [11, 12]), ("lava-point/mine", [6, 7])];
+    let lose = |world: &str, lost: [usize; 2]| {
+        for (seed, lost) in (1..).zip(lost) {
+            let folder = folder(dir.path(), world, 2.0, seed);
+            let mut text = "steps,end,return\n".to_owned();
+            text += &"1,lava,-1\n".repeat(lost);
+            text += &"1,goal,1\n".repeat(100 - lost);
+            fs::write(folder.join("episodes.csv"), text).unwrap();
+        }
+    };
+    names[..2].iter().for_each(|(name, lost)| lose(name, *lost));
+    report::write(dir.path()).unwrap();
+    let rows = csv(dir.path(), "table.csv");
+    let names_of = |rows: &[BTreeMap<String, String>]| -> Vec<String> {
+        rows.iter().map(|row| row["method"].clone()).collect()
+    };
+    assert_eq!(
+        names_of(&rows),
+        ["game", "k-1"],
+        "only one method: its variants need no other name"
+    );
+    names[2..].iter().for_each(|(name, lost)| lose(name, *lost));
+    let terminal = report::write(dir.path()).unwrap();
+    let rows = csv(dir.path(), "table.csv");
+    assert_eq!(names_of(&rows), ["game", "game/k-1", "mine"]);
+    // An episode of 100 between -1 and 1 moves CVaR_{1/2} by 0.04.
+    for (name, versus) in [("game", ""), ("game/k-1", "-0.400000"), ("mine", "-0.200000")] {
+        assert_eq!(row(&rows, &[("method", name)])["versus"], versus, "{name}");
+    }
+    assert!(terminal.contains("lava-point: against game"), "{terminal}");
+    let runs = csv(dir.path(), "runs.csv");
+    assert_eq!(runs.len(), 6);
+    row(
+        &runs,
+        &[("method", "game"), ("variant", "k-1"), ("seed", "2"), ("greedy_lava", "0.120000")],
+    );
+    row(&runs, &[("method", "mine"), ("variant", ""), ("seed", "1")]);
+    assert_eq!(csv(dir.path(), "cross.csv").len(), 21);
+    let json = report::table_json(dir.path(), &[]).unwrap();
+    let of = &json["worlds"][0]["rows"][1];
+    assert_eq!((of["method"].as_str(), of["variant"].as_str()), (Some("game"), Some("k-1")));
+}
+
+/// What `write` leaves in a folder, but for the folders of runs and the archive.
+fn written(dir: &Path) -> BTreeMap<String, Vec<u8>> {
+    report::write(dir).unwrap();
+    let names = ["runs.csv", "table.csv", "table.md", "table.tex", "cross.csv"];
+    names.into_iter().map(|name| (name.to_owned(), fs::read(dir.join(name)).unwrap())).collect()
+}
+
+#[test]
+fn packed_runs_are_read_as_if_their_folders_were_there() {
+    let dir = tempfile::tempdir().unwrap();
+    realistic(dir.path());
+    manifest(dir.path(), "lava-grid", 25.0, 9, Some("update 17: loss of the antagonist is NaN"));
+    fs::create_dir_all(dir.path().join("lava-grid/eta-25/seed-8")).unwrap();
+    let weights = dir.path().join("lava-grid/eta-25/seed-3/final.safetensors");
+    fs::write(&weights, "weights").unwrap();
+    let evaluation = dir.path().join("lava-grid/eta-25/seed-2/evaluation.json");
+    let text = fs::read(&evaluation).unwrap();
+    let before = written(dir.path());
+
+    let summary = archive::pack(dir.path(), false).unwrap();
+    assert_eq!((summary.packed, summary.runs), (19, 19));
+    // A run that has not ended stays, and so do weights.
+    let left = ["lava-grid/eta-25/seed-3", "lava-grid/eta-25/seed-8"].map(|of| dir.path().join(of));
+    assert_eq!(BTreeSet::from_iter(summary.left), BTreeSet::from_iter(left));
+    assert!(weights.exists() && !evaluation.exists() && !dir.path().join("lava-point").exists());
+    assert_eq!(written(dir.path()), before);
+    let bytes = fs::read(dir.path().join("runs.zip")).unwrap();
+
+    // A run in a folder wins over the archive, and another `pack` replaces it there.
+    fs::create_dir_all(evaluation.parent().unwrap()).unwrap();
+    fs::write(&evaluation, String::from_utf8(text.clone()).unwrap().replace("12.5", "99.5"))
+        .unwrap();
+    let changed = written(dir.path());
+    assert_ne!(changed, before);
+    let summary = archive::pack(dir.path(), false).unwrap();
+    assert_eq!((summary.packed, summary.runs), (1, 19));
+    assert_eq!(written(dir.path()), changed);
+    // The same files, the same bytes; the name of the folder may be that of this version.
+    let renamed = dir.path().join("lava-grid/game/eta-25/seed-2/");
+    fs::create_dir_all(&renamed).unwrap();
+    fs::write(renamed.join("evaluation.json"), &text).unwrap();
+    manifest(dir.path(), "lava-grid/game", 25.0, 2, None);
+    assert_eq!(archive::pack(dir.path(), false).unwrap().runs, 19);
+    assert_eq!(written(dir.path()), before);
+    let again = tempfile::tempdir().unwrap();
+    realistic(again.path());
+    manifest(again.path(), "lava-grid", 25.0, 9, Some("update 17: loss of the antagonist is NaN"));
+    archive::pack(again.path(), false).unwrap();
+    assert_eq!(fs::read(again.path().join("runs.zip")).unwrap(), bytes);
+}
+
+#[test]
+fn damaged_archives_and_members_are_named() {
+    let dir = tempfile::tempdir().unwrap();
+    realistic(dir.path());
+    archive::pack(dir.path(), false).unwrap();
+    let path = dir.path().join("runs.zip");
+    let sound = fs::read(&path).unwrap();
+    // In the middle of the first member's data.
+    let mut bytes = sound.clone();
+    bytes[200] ^= 0xff;
+    fs::write(&path, &bytes).unwrap();
+    let said = report::write(dir.path()).unwrap();
+    let said = said.split_whitespace().collect::<Vec<_>>().join(" ");
+    assert!(said.contains("LEFT OUT: lava-grid/eta-1/seed-1."), "{said}");
+    assert!(said.contains("runs.zip/lava-grid/eta-1/seed-1/"), "{said}");
+    assert_eq!(csv(dir.path(), "runs.csv").len(), 17);
+    for bytes in [&sound[..sound.len() / 2], b"not an archive"] {
+        fs::write(&path, bytes).unwrap();
+        let error = report::write(dir.path()).unwrap_err().to_string();
+        assert!(error.contains("runs.zip"), "{error}");
+        assert!(archive::pack(dir.path(), false).is_err());
+    }
+}
+
+/// A member that is far larger than any file of a run takes no more memory than one.
+#[test]
+fn a_bomb_in_an_archive_is_refused() {
+    use std::io::Write;
+    let dir = tempfile::tempdir().unwrap();
+    realistic(dir.path());
+    let file = fs::File::create(dir.path().join("runs.zip")).unwrap();
+    let mut bomb = zip::ZipWriter::new(file);
+    let options = zip::write::SimpleFileOptions::default();
+    bomb.start_file("lava-grid/eta-25/seed-77/evaluation.json", options).unwrap();
+    let zeros = vec![0; 1 << 20];
+    (0..65).for_each(|_| bomb.write_all(&zeros).unwrap());
+    // Names that lead out of the folder are no runs.
+    bomb.start_file("../../lava-grid/eta-25/seed-78/evaluation.json", options).unwrap();
+    bomb.finish().unwrap();
+    let said = report::write(dir.path()).unwrap();
+    assert!(
+        said.contains("LEFT OUT: lava-grid/eta-25/seed-77") && said.contains("larger than"),
+        "{said}"
+    );
+    assert_eq!(csv(dir.path(), "runs.csv").len(), 18);
+}
+
+/// The committed tables are those of the committed archives.
+#[test]
+fn committed_results_make_their_tables_again() {
+    let results = Path::new(env!("CARGO_MANIFEST_DIR")).join("results");
+    for sweep in ["paper", "paper-plain", "paper-held-out", "ablations"] {
+        let dir = tempfile::tempdir().unwrap();
+        let (from, to) = (results.join(sweep), dir.path().join(sweep));
+        fs::create_dir(&to).unwrap();
+        fs::copy(from.join("runs.zip"), to.join("runs.zip")).unwrap();
+        for (name, bytes) in written(&to) {
+            assert!(bytes == fs::read(from.join(&name)).unwrap(), "results/{sweep}/{name} differs");
+        }
+    }
 }
 
 /// With TeX Live's pdflatex (Debian: texlive-latex-base, texlive-latex-recommended).

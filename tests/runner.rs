@@ -1,10 +1,12 @@
 //! The runner: order, number at a time, failures, what is kept and what is refused; with a mock in
 //! place of training, and with a shell script in place of a worker.
 
+use cvar_game::experiment::archive;
 use cvar_game::experiment::artefacts::{Evaluation, Manifest, SCHEMA};
-use cvar_game::experiment::config::{Config, RunConfig, Setting};
+use cvar_game::experiment::config::{Config, RunConfig, Setting, Source};
 use cvar_game::experiment::lock::RunLock;
 use cvar_game::experiment::plan;
+use cvar_game::experiment::registry::standard;
 use cvar_game::experiment::runner::{
     self, Event, Failure, Launcher, Outcome, Prepared, Report, RunnerError, Tick, Workers,
 };
@@ -28,15 +30,15 @@ fn config_with(seeds: &[u64], sets: &[&str]) -> Config {
     settings.extend(sets);
     let settings: Vec<Setting> =
         settings.into_iter().map(|set| Setting::parse(set).unwrap()).collect();
-    Config::resolve(None, &settings).unwrap()
+    Config::resolve(standard().catalogue(), Source::Default, &settings).unwrap()
 }
 
-fn prepare(config: &Config, out: &Path) -> Result<Prepared, RunnerError> {
-    runner::prepare(config, &plan::runs(config), out)
+fn prepare(config: &Config, out: &Path) -> Result<Prepared<'static>, RunnerError> {
+    runner::prepare(standard().catalogue(), config, &plan::runs(config), out)
 }
 
 fn run_folder(out: &Path, seed: u64) -> PathBuf {
-    out.join(format!("lava-grid/eta-1/seed-{seed}"))
+    out.join(format!("lava-grid/game/eta-1/seed-{seed}"))
 }
 
 /// What `sweep` did, and what it told, as short texts.
@@ -67,7 +69,7 @@ fn sweep(
 fn finish(run: &RunConfig, folder: &Path) {
     let evaluation = Evaluation {
         schema: SCHEMA,
-        env: run.env.name().to_string(),
+        env: run.env.world.to_string(),
         eta: run.eta.get(),
         seed: run.seed,
         steps: run.train.steps,
@@ -91,7 +93,10 @@ impl<F: Fn(u64, &Path, &Stop) -> Result<(), Failure> + Sync> Launcher for Mock<F
         stop: &Stop,
         report: &mut dyn FnMut(Report),
     ) -> Result<(), Failure> {
-        assert_eq!(RunConfig::load(&folder.join("config.toml")).unwrap(), *run);
+        assert_eq!(
+            RunConfig::load(&folder.join("config.toml"), standard().catalogue()).unwrap(),
+            *run
+        );
         report(Report::Tick(Tick { steps: 10, mean_return: f64::NAN }));
         (self.0)(run.seed, folder, stop)?;
         finish(run, folder);
@@ -175,7 +180,7 @@ fn a_failed_run_is_told_and_the_others_go_on() {
     let manifest = fs::read(run_folder(out.path(), 1).join("manifest.json")).unwrap();
     let manifest: Manifest = serde_json::from_slice(&manifest).unwrap();
     assert_eq!(manifest.failure.as_deref(), Some("NaN in the loss"));
-    assert_eq!((manifest.run.as_str(), manifest.steps), ("lava-grid/eta-1/seed-1", 10));
+    assert_eq!((manifest.run.as_str(), manifest.steps), ("lava-grid/game/eta-1/seed-1", 10));
 }
 
 #[test]
@@ -201,7 +206,7 @@ fn a_run_without_an_evaluation_has_failed() {
 fn a_run_with_an_evaluation_is_finished_however_its_process_ended() {
     let out = tempfile::tempdir().unwrap();
     let config = config(&[1]);
-    let run = config.run(plan::runs(&config)[0]);
+    let run = config.run(&plan::runs(&config)[0]);
     let mock = Mock(|_, folder: &Path, _: &Stop| {
         finish(&run, folder);
         Err(Failure::Failed("killed in its last moment".into()))
@@ -233,6 +238,30 @@ fn finished_runs_are_kept_and_unfinished_ones_are_launched_again() {
     assert_eq!(outcome.finished, 1);
     assert_eq!(files(&run_folder(out.path(), 1)), before);
     sweep(&config(&[1, 2]), out.path(), 1, &Mock(never), &Stop::default());
+}
+
+/// Also under the name that runs have without their method.
+#[test]
+fn a_packed_run_is_finished_and_not_carried_out_again() {
+    let out = tempfile::tempdir().unwrap();
+    let config = config(&[1, 2]);
+    sweep(&config, out.path(), 1, &Mock(succeed), &Stop::default());
+    assert_eq!(archive::pack(out.path(), false).unwrap().packed, 2);
+    assert!(!out.path().join("lava-grid").exists());
+    let evaluation = runner::read_evaluation(&run_folder(out.path(), 2)).unwrap().unwrap();
+    assert_eq!(evaluation.seed, 2);
+
+    let prepared = prepare(&config, out.path()).unwrap();
+    assert_eq!((prepared.todo.len(), prepared.finished.len()), (0, 2));
+    let other = config_with(&[1, 2], &["env.slip=0.1"]);
+    let error = prepare(&other, out.path()).unwrap_err().to_string();
+    assert!(error.contains("another configuration (env.lava-grid.slip is 0.05 there"), "{error}");
+    let more = config_with(&[1, 2, 3], &[]);
+    let (outcome, told) = sweep(&more, out.path(), 1, &Mock(succeed), &Stop::default());
+    assert_eq!(outcome.finished, 1);
+    assert_eq!(told.first().map(String::as_str), Some("3 started"));
+    fs::write(out.path().join("runs.zip"), "damaged").unwrap();
+    assert!(prepare(&config, out.path()).unwrap_err().to_string().contains("cannot be read"));
 }
 
 #[test]
@@ -340,7 +369,7 @@ fn a_run_that_another_process_works_on_is_left_alone_until_it_is_free() {
 fn a_run_that_another_process_finishes_meanwhile_is_not_done_again() {
     let out = tempfile::tempdir().unwrap();
     let config = config(&[1, 2]);
-    let other = config.run(plan::runs(&config)[1]);
+    let other = config.run(&plan::runs(&config)[1]);
     let mock = Mock(|seed, _: &Path, _: &Stop| {
         assert_eq!(seed, 1);
         let folder = run_folder(out.path(), 2);
@@ -367,7 +396,7 @@ fn two_sweeps_at_once_do_every_run_once() {
         launched.lock().unwrap().push(seed);
         std::thread::sleep(Duration::from_millis(20));
         fs::write(folder.join("done"), "").unwrap();
-        let run = RunConfig::load(&folder.join("config.toml")).unwrap();
+        let run = RunConfig::load(&folder.join("config.toml"), standard().catalogue()).unwrap();
         finish(&run, folder);
         Ok(())
     });

@@ -1,13 +1,15 @@
 //! Control steps per second of a batch of 250 episodes with random actions, observation included.
 //!
 //! Random pushes keep discs at the walls more than a policy does. `lava-point/open` is the same batch
-//! with the walls out of reach, so that Rapier is never called: what `lava-point/batch` takes longer is
-//! the time of Rapier's pipeline. `lava-point/rapier-alone` has every substep of every disc in Rapier,
-//! free flight included: what the separate free flight saves.
+//! with the walls out of reach, so that Rapier is not called: the difference to `lava-point/batch` is
+//! the time of Rapier's pipeline. `lava-point/rapier-alone` computes every substep of every disc in
+//! Rapier, free flight included: the difference is what the separate free flight saves.
 
 use criterion::{Criterion, Throughput, criterion_group, criterion_main};
 use lava_envs::random::{ChaCha8Rng, Purpose, stream};
-use lava_envs::{Force, GridConfig, LavaGrid, LavaPoint, Law, Move, PointConfig, Step, World};
+use lava_envs::{
+    Discrete, Force, GridConfig, LavaGrid, LavaPoint, Law, Move, PointConfig, Step, World,
+};
 use nalgebra::Vector2;
 use rand::RngExt;
 use rand_distr::StandardNormal;

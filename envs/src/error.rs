@@ -1,8 +1,9 @@
-//! What can be wrong with what a world is given: its configuration, and states to go on from.
+//! What can be wrong with what a world is given: its constants, and states to continue from.
 
 use thiserror::Error;
 
-/// A configuration that describes no world. Each message says where, what was found and what to do.
+/// Constants that describe no world. Each message says where the problem is, what was found and what
+/// to do.
 #[derive(Debug, Clone, PartialEq, Eq, Error)]
 pub enum ConfigError {
     /// A value outside its range.
@@ -12,10 +13,10 @@ pub enum ConfigError {
         field: &'static str,
         /// The value that was found.
         value: String,
-        /// What may stand there instead.
+        /// The values that are allowed.
         allowed: String,
     },
-    /// A map that is no map; row and column count from 1, as an editor shows them.
+    /// A picture that is no map; row and column count from 1, as an editor shows them.
     #[error("map, row {row}, column {column}: {problem}; {remedy}")]
     Map {
         /// Row in the text, from 1.
@@ -35,13 +36,15 @@ pub enum ConfigError {
 pub struct NoSuchState(pub String);
 
 impl NoSuchState {
-    pub(crate) fn of(snapshot: &impl std::fmt::Debug) -> Self {
+    /// The refusal of a snapshot.
+    pub fn of(snapshot: &impl std::fmt::Debug) -> Self {
         NoSuchState(format!("{snapshot:?}"))
     }
 }
 
 impl ConfigError {
-    pub(crate) fn value(
+    /// A value of a field that is out of range; `allowed` says which values are in range.
+    pub fn value(
         field: &'static str,
         value: impl std::fmt::Debug,
         allowed: impl Into<String>,
@@ -51,7 +54,10 @@ impl ConfigError {
 }
 
 /// Requires a finite number that passes `test`; `allowed` says which ones do.
-pub(crate) fn require(
+///
+/// # Errors
+/// Names the field, its value and the allowed ones, if the number does not pass.
+pub fn require(
     field: &'static str,
     value: f64,
     test: impl Fn(f64) -> bool,

@@ -10,14 +10,25 @@
 //! Source: the gridworld of "A Game-Theoretic Perspective on Risk-Sensitive Reinforcement Learning"
 //! (arXiv 2109.09470).
 
+use crate::action::{Action, Discrete, Finite, uniform_index};
 use crate::error::{ConfigError, NoSuchState, require};
-use crate::law::{FiniteLaw, MOVES};
+use crate::finite::FiniteModel;
+use crate::law::FiniteLaw;
 use crate::map::{Map, Tile};
+use crate::scene::{Area, AreaKind, Field, Scene};
 use crate::world::{End, Step, World};
+use rand::Rng;
 use serde::{Deserialize, Serialize};
 
-/// The map of the paper's experiment: 10 x 7 cells, lava in columns 2..=7 of the two upper rows.
-pub const PAPER_MAP: &str = "\
+/// Number of moves, which are both the actions and the outcomes of chance.
+pub const MOVES: usize = 4;
+
+/// The constants, with what they mean, their defaults and their ranges.
+const DEFAULTS: &str = r#"# lava-grid: a walk over the cells of a map, with slips. Lengths are in cells.
+
+# The map: S start (one), G goal, L lava, . free, # wall. The paper's 10 x 7 cells. Rows are equally
+# long; white space around them does not count.
+map = """
 S.LLLLLL.G
 ..LLLLLL..
 ..........
@@ -25,38 +36,51 @@ S.LLLLLL.G
 ..........
 ..........
 ..........
-";
+"""
 
-/// Constants of `lava-grid`.
+# Probability that a move other than the chosen one is executed. The paper's 0.05.
+# Range: [0, 1]
+slip = 0.05
+
+# What a step costs that ends in neither goal nor lava: it is subtracted. The paper's 0.035.
+# Range: [0, inf)
+step_cost = 0.035
+
+# Reward on entering a goal, which ends the episode.
+# Range: (-inf, inf)
+goal_reward = 1.0
+
+# Reward on entering lava, which ends the episode.
+# Range: (-inf, inf)
+lava_reward = -1.0
+
+# Time limit T in steps. A true end of the episode: nothing is bootstrapped. The paper's 40.
+# Range: [1, 4294967295]
+horizon = 40
+"#;
+
+/// Constants of `lava-grid`; [`LavaGrid::DEFAULTS`] explains them and has their defaults and ranges.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(default, deny_unknown_fields)]
+#[serde(deny_unknown_fields)]
 pub struct GridConfig {
-    /// The map as a picture, see [`crate::map`]; default [`PAPER_MAP`]; at most
-    /// [`crate::map::MAX_CELLS`] cells.
+    /// The map as a picture, see [`crate::map`].
     pub map: String,
-    /// Probability p that another than the chosen move is executed; default 0.05; in [0, 1].
+    /// Probability p that a move other than the chosen one is executed.
     pub slip: f64,
-    /// What a step costs that does not end in goal or lava, subtracted from the return; default
-    /// 0.035; at least 0.
+    /// Cost of a step that ends in neither goal nor lava: it is subtracted from the return.
     pub step_cost: f64,
-    /// Reward on entering a goal; default 1; any finite number.
+    /// Reward on entering a goal.
     pub goal_reward: f64,
-    /// Reward on entering lava; default -1; any finite number.
+    /// Reward on entering lava.
     pub lava_reward: f64,
-    /// Time limit T in steps; default 40; at least 1.
+    /// Time limit T in steps.
     pub horizon: u32,
 }
 
 impl Default for GridConfig {
+    /// What [`LavaGrid::DEFAULTS`] says.
     fn default() -> Self {
-        GridConfig {
-            map: PAPER_MAP.to_owned(),
-            slip: 0.05,
-            step_cost: 0.035,
-            goal_reward: 1.0,
-            lava_reward: -1.0,
-            horizon: 40,
-        }
+        LavaGrid::defaults()
     }
 }
 
@@ -99,21 +123,29 @@ impl Move {
     /// All moves, ordered by index.
     pub const ALL: [Move; MOVES] = [Move::Up, Move::Down, Move::Right, Move::Left];
 
-    /// Position in [`Move::ALL`], which is also the outcome in a [`FiniteLaw`].
-    pub fn index(self) -> usize {
-        self as usize
-    }
-
     /// The move in a word, as in files.
     pub fn name(self) -> &'static str {
         ["up", "down", "right", "left"][self.index()]
     }
+}
 
-    /// The move of an index.
-    ///
-    /// # Panics
-    /// If the index is not below [`MOVES`].
-    pub fn from_index(index: usize) -> Move {
+impl Action for Move {
+    type Kind = Finite;
+
+    fn uniform(random: &mut impl Rng) -> Move {
+        uniform_index(random)
+    }
+}
+
+/// The index is the position in [`Move::ALL`], which is also the outcome in a [`FiniteLaw`].
+impl Discrete for Move {
+    const COUNT: usize = MOVES;
+
+    fn index(self) -> usize {
+        self as usize
+    }
+
+    fn from_index(index: usize) -> Move {
         Move::ALL[index]
     }
 }
@@ -137,26 +169,6 @@ pub struct LavaGrid {
 }
 
 impl LavaGrid {
-    /// A batch of `episodes` slots, all in the initial state.
-    ///
-    /// # Errors
-    /// If a value of the configuration is out of range or its map is none.
-    pub fn new(config: &GridConfig, episodes: usize) -> Result<Self, ConfigError> {
-        let map = config.parse()?;
-        let initial = Episode { cell: map.start(), time: 0, ended: false };
-        Ok(LavaGrid {
-            config: config.clone(),
-            clearance: clearance(&map),
-            episodes: vec![initial; episodes],
-            map,
-        })
-    }
-
-    /// The constants of this world.
-    pub fn config(&self) -> &GridConfig {
-        &self.config
-    }
-
     /// The map of this world.
     pub fn map(&self) -> &Map {
         &self.map
@@ -222,30 +234,16 @@ impl LavaGrid {
         (next, step)
     }
 
-    /// The nominal law of the executed move, which depends on the chosen move alone.
-    pub fn law_of(&self, chosen: Move) -> FiniteLaw {
+    /// The nominal law of the executed move, which depends only on the chosen move.
+    pub fn law_of(&self, chosen: Move) -> FiniteLaw<MOVES> {
         let mut probabilities = [self.config.slip / 3.0; MOVES];
         probabilities[chosen.index()] = 1.0 - self.config.slip;
         FiniteLaw { probabilities }
     }
 
-    /// Whether the slot's episode has ended.
-    pub fn is_over(&self, slot: usize) -> bool {
-        self.episodes[slot].ended
-    }
-
-    /// The cell an episode is in.
-    pub fn state(&self, slot: usize) -> usize {
-        self.episodes[slot].cell
-    }
-
-    /// Puts the slot's episode into `cell` after `time` steps, to look at states one by one.
-    ///
-    /// # Panics
-    /// If there is no such cell.
-    pub fn place(&mut self, slot: usize, cell: usize, time: u32) {
-        assert!(cell < self.cells(), "cell {cell} of a map with {}", self.cells());
-        self.episodes[slot] = Episode { cell, time, ended: false };
+    fn coordinates_of(&self, cell: usize) -> [f64; 2] {
+        let (x, y) = self.map.coordinates(cell);
+        [x as f64, y as f64]
     }
 
     fn neighbour(&self, cell: usize, executed: Move) -> usize {
@@ -299,14 +297,38 @@ fn clearance(map: &Map) -> Vec<f64> {
 }
 
 impl World for LavaGrid {
+    type Constants = GridConfig;
     type Action = Move;
-    type Law = FiniteLaw;
+    type Law = FiniteLaw<MOVES>;
     type Snapshot = Episode;
+
+    const NAME: &'static str = "lava-grid";
+    const DEFAULTS: &'static str = DEFAULTS;
+    const OUTCOMES_ARE_ACTIONS: bool = true;
 
     /// (x, y), each mapped from its first to its last cell onto [-1, 1].
     const OBSERVATION: usize = 2;
     /// (x, y) likewise, then the probabilities of the four moves.
     const SITUATION: usize = 2 + MOVES;
+
+    fn new(config: &GridConfig, episodes: usize) -> Result<Self, ConfigError> {
+        let map = config.parse()?;
+        let initial = Episode { cell: map.start(), time: 0, ended: false };
+        Ok(LavaGrid {
+            config: config.clone(),
+            clearance: clearance(&map),
+            episodes: vec![initial; episodes],
+            map,
+        })
+    }
+
+    fn constants(&self) -> &GridConfig {
+        &self.config
+    }
+
+    fn validate(constants: &GridConfig) -> Result<(), ConfigError> {
+        constants.validate()
+    }
 
     fn episodes(&self) -> usize {
         self.episodes.len()
@@ -343,7 +365,7 @@ impl World for LavaGrid {
         observation.copy_from_slice(&self.scaled_position(slot));
     }
 
-    fn law(&self, _slot: usize, action: Move) -> FiniteLaw {
+    fn law(&self, _slot: usize, action: Move) -> FiniteLaw<MOVES> {
         self.law_of(action)
     }
 
@@ -362,8 +384,82 @@ impl World for LavaGrid {
     }
 
     fn position(&self, slot: usize) -> [f64; 2] {
-        let (x, y) = self.map.coordinates(self.episodes[slot].cell);
-        [x as f64, y as f64]
+        self.coordinates_of(self.episodes[slot].cell)
+    }
+
+    fn scene(&self) -> Scene {
+        let cell = |cell: usize| {
+            let [x, y] = self.coordinates_of(cell);
+            ([x, y], [x + 1.0, y + 1.0])
+        };
+        let kind = |of: usize| match self.map.tile(of) {
+            Tile::Free => None,
+            Tile::Lava => Some(AreaKind::Lava),
+            Tile::Goal => Some(AreaKind::Goal),
+            Tile::Wall => Some(AreaKind::Wall),
+        };
+        let area = |of: usize| {
+            let (min, max) = cell(of);
+            kind(of).map(|kind| Area { kind, min, max })
+        };
+        let GridConfig { slip, step_cost, goal_reward, lava_reward, horizon, .. } = &self.config;
+        Scene {
+            size: [self.width() as f64, self.height() as f64],
+            cells: true,
+            start: self.coordinates_of(self.start()),
+            areas: (0..self.cells()).filter_map(area).collect(),
+            rules: format!(
+                "A step costs {step_cost}, lava pays {lava_reward} and the goal {goal_reward}, both of \
+                 which end the episode; so does step {horizon}. With probability {slip} a move other \
+                 than the chosen one is executed."
+            ),
+        }
+    }
+
+    fn headline(&self) -> String {
+        format!("slip {}, step cost {}", self.config.slip, self.config.step_cost)
+    }
+
+    fn state_columns(&self, slot: usize) -> Vec<(&'static str, Field)> {
+        let [x, y] = self.position(slot);
+        vec![("x", Field::Number(x)), ("y", Field::Number(y))]
+    }
+
+    fn action_columns(action: Move) -> Vec<(&'static str, Field)> {
+        vec![("action", Field::Word(action.name()))]
+    }
+
+    fn outcome_columns(outcome: usize) -> Vec<(&'static str, Field)> {
+        vec![("executed", Field::Word(Move::from_index(outcome).name()))]
+    }
+
+    fn action_arrow(action: Move) -> [f64; 2] {
+        match action {
+            Move::Up => [0.0, -1.0],
+            Move::Down => [0.0, 1.0],
+            Move::Right => [1.0, 0.0],
+            Move::Left => [-1.0, 0.0],
+        }
+    }
+
+    fn outcome_arrow(outcome: usize) -> [f64; 2] {
+        Self::action_arrow(Move::from_index(outcome))
+    }
+
+    fn intended(action: Move) -> Option<usize> {
+        Some(action.index())
+    }
+
+    fn executed(outcome: usize) -> Option<Move> {
+        Some(Move::from_index(outcome))
+    }
+
+    fn finite(&self) -> Option<&dyn FiniteModel> {
+        Some(self)
+    }
+
+    fn finite_mut(&mut self) -> Option<&mut dyn FiniteModel> {
+        Some(self)
     }
 
     fn apply(&mut self, actions: &[Move], outcomes: &[usize], steps: &mut [Step]) {
@@ -384,5 +480,70 @@ impl World for LavaGrid {
             episode.ended = step.end.is_some();
             self.episodes[slot] = episode;
         }
+    }
+}
+
+/// States are cells, actions and outcomes are moves.
+impl FiniteModel for LavaGrid {
+    fn states(&self) -> usize {
+        self.cells()
+    }
+
+    fn start(&self) -> usize {
+        self.map.start()
+    }
+
+    fn actions(&self) -> usize {
+        MOVES
+    }
+
+    fn outcomes(&self) -> usize {
+        MOVES
+    }
+
+    fn ended(&self, cell: usize) -> Option<End> {
+        match self.map.tile(cell) {
+            Tile::Goal => Some(End::Goal),
+            Tile::Lava => Some(End::Lava),
+            Tile::Free | Tile::Wall => None,
+        }
+    }
+
+    fn probabilities(&self, _cell: usize, chosen: usize) -> Vec<f64> {
+        self.law_of(Move::from_index(chosen)).probabilities.to_vec()
+    }
+
+    fn successor(&self, cell: usize, _chosen: usize, executed: usize) -> (usize, Step) {
+        self.successor(cell, Move::from_index(executed))
+    }
+
+    fn intended_outcome(&self, action: usize) -> Option<usize> {
+        Some(action)
+    }
+
+    fn action_name(&self, action: usize) -> &'static str {
+        Move::from_index(action).name()
+    }
+
+    fn arrow(&self, action: usize) -> [f64; 2] {
+        LavaGrid::action_arrow(Move::from_index(action))
+    }
+
+    fn coordinates(&self, cell: usize) -> [usize; 2] {
+        let (x, y) = self.map.coordinates(cell);
+        [x, y]
+    }
+
+    fn state(&self, slot: usize) -> usize {
+        self.episodes[slot].cell
+    }
+
+    fn is_over(&self, slot: usize) -> bool {
+        self.episodes[slot].ended
+    }
+
+    fn place(&mut self, slot: usize, cell: usize, time: u32) {
+        assert!(cell < self.cells(), "cell {cell} of a map with {}", self.cells());
+        self.episodes[slot] = Episode { cell, time, ended: false };
     }
 }

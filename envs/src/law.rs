@@ -1,32 +1,34 @@
-//! Nominal laws of chance: finite, over the four moves, and standard normal in the plane.
+//! Nominal laws of chance: finite, over any number of outcomes, and standard normal in the plane.
 
 use nalgebra::Vector2;
 use rand::{Rng, RngExt};
 use rand_distr::StandardNormal;
 
 /// A nominal law P_t(o) with respect to a reference measure (counting or Lebesgue).
-pub trait Law: Copy + std::fmt::Debug + Send + Sync {
+pub trait Law: Copy + std::fmt::Debug + Send + Sync + 'static {
     /// What chance decides.
-    type Outcome: Copy + std::fmt::Debug + PartialEq + Send + Sync;
+    type Outcome: Copy + std::fmt::Debug + PartialEq + Send + Sync + 'static;
 
     /// Draws an outcome.
     fn sample<R: Rng>(&self, random: &mut R) -> Self::Outcome;
 
     /// log P_t(o), in nats.
     fn log_density(&self, outcome: Self::Outcome) -> f64;
+
+    /// The outcome of an index, where outcomes are finitely many.
+    fn outcome(_index: usize) -> Option<Self::Outcome> {
+        None
+    }
 }
 
-/// Number of outcomes of a [`FiniteLaw`].
-pub const MOVES: usize = 4;
-
-/// A law over `MOVES` outcomes; some may have probability zero.
+/// A law over `N` outcomes, numbered from 0; some may have probability zero.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct FiniteLaw {
+pub struct FiniteLaw<const N: usize> {
     /// Probabilities, which sum to 1.
-    pub probabilities: [f64; MOVES],
+    pub probabilities: [f64; N],
 }
 
-impl Law for FiniteLaw {
+impl<const N: usize> Law for FiniteLaw<N> {
     type Outcome = usize;
 
     fn sample<R: Rng>(&self, random: &mut R) -> usize {
@@ -35,6 +37,10 @@ impl Law for FiniteLaw {
 
     fn log_density(&self, outcome: usize) -> f64 {
         self.probabilities[outcome].ln()
+    }
+
+    fn outcome(index: usize) -> Option<usize> {
+        (index < N).then_some(index)
     }
 }
 
@@ -52,7 +58,7 @@ pub fn sample_index<R: Rng>(probabilities: &[f64], random: &mut R) -> usize {
             last = index;
         }
     }
-    last // reached by rounding alone
+    last // reached only by rounding
 }
 
 /// The standard normal law N(0, I) of the noise xi in the plane (dimensionless).

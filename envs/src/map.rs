@@ -44,8 +44,8 @@ impl Map {
     /// Reads a picture.
     ///
     /// # Errors
-    /// If the picture is empty, not rectangular, too large, has an unknown character, has not exactly
-    /// one start or has no goal. The message names the row and the column.
+    /// If the picture is empty, not rectangular, too large, has an unknown character, does not have
+    /// exactly one start, or has no goal. The message names the row and the column.
     pub fn parse(picture: &str) -> Result<Map, ConfigError> {
         let error = |row: usize, column: usize, problem: String, remedy: &str| ConfigError::Map {
             row: row + 1,
@@ -143,7 +143,7 @@ impl Map {
     /// The cell in column x and row y.
     ///
     /// # Panics
-    /// If there is none.
+    /// If the map has no such cell.
     pub fn cell(&self, x: usize, y: usize) -> usize {
         assert!(x < self.width && y < self.height(), "cell ({x}, {y}) lies outside the map");
         y * self.width + x

@@ -20,12 +20,15 @@ pub mod physics;
 
 pub use config::{PointConfig, Rectangle};
 
+use crate::action::{Action, Plane};
 use crate::error::{ConfigError, NoSuchState};
 use crate::law::GaussianLaw;
+use crate::scene::{Area, AreaKind, Field, Scene as Picture};
 use crate::world::{End, Step, World};
 use geometry::Scene;
 use nalgebra::Vector2;
 use physics::{Body, Physics};
+use rand::{Rng, RngExt};
 use rapier2d::math::Vector;
 use serde::{Deserialize, Serialize};
 
@@ -42,6 +45,17 @@ impl Force {
     pub fn on_disc(self) -> Vector2<f64> {
         let length = self.0.norm();
         if length > 1.0 { self.0 / length } else { self.0 }
+    }
+}
+
+impl Action for Force {
+    type Kind = Plane;
+
+    /// Uniform on the unit disc.
+    fn uniform(random: &mut impl Rng) -> Force {
+        let (angle, length) =
+            (random.random::<f64>() * std::f64::consts::TAU, random.random::<f64>().sqrt());
+        Force(Vector2::new(length * angle.cos(), length * angle.sin()))
     }
 }
 
@@ -73,24 +87,6 @@ pub struct LavaPoint {
 }
 
 impl LavaPoint {
-    /// A batch of `episodes` slots, all in the initial state.
-    ///
-    /// # Errors
-    /// If a value of the configuration is out of range.
-    pub fn new(config: &PointConfig, episodes: usize) -> Result<Self, ConfigError> {
-        config.validate()?;
-        let start = Body { position: vector(config.start), velocity: Vector::ZERO };
-        Ok(LavaPoint {
-            scene: Scene::new(config),
-            physics: Physics::new(config, episodes),
-            bodies: vec![start; episodes],
-            clocks: vec![Clock { time: 0, ended: false }; episodes],
-            moving: Vec::with_capacity(episodes),
-            before: Vec::with_capacity(episodes),
-            config: config.clone(),
-        })
-    }
-
     /// The same world with every substep of every body in Rapier, free flight included. Bit for bit
     /// equal and slower; for tests and benchmarks.
     ///
@@ -100,11 +96,6 @@ impl LavaPoint {
         let mut world = LavaPoint::new(config, episodes)?;
         world.physics.give_all_to_rapier();
         Ok(world)
-    }
-
-    /// The constants of this world.
-    pub fn config(&self) -> &PointConfig {
-        &self.config
     }
 
     /// Velocity of the disc in m/s.
@@ -149,15 +140,42 @@ fn floats(vector: Vector) -> [f64; 2] {
 }
 
 impl World for LavaPoint {
+    type Constants = PointConfig;
     type Action = Force;
     type Law = GaussianLaw;
     type Snapshot = Snapshot;
+
+    const NAME: &'static str = "lava-point";
+    const DEFAULTS: &'static str = config::DEFAULTS;
+    const TRAINING: &'static str = config::TRAINING;
 
     /// Position, mapped from the arena onto [-1, 1]^2, and velocity in units of [`OBSERVED_SPEED`].
     const OBSERVATION: usize = 4;
     /// Position likewise, and the mean post-force velocity vbar likewise. The parameters of the law
     /// are constants (xi is standard normal, sigma is the config's) and are therefore left out.
     const SITUATION: usize = 4;
+
+    fn new(config: &PointConfig, episodes: usize) -> Result<Self, ConfigError> {
+        config.validate()?;
+        let start = Body { position: vector(config.start), velocity: Vector::ZERO };
+        Ok(LavaPoint {
+            scene: Scene::new(config),
+            physics: Physics::new(config, episodes),
+            bodies: vec![start; episodes],
+            clocks: vec![Clock { time: 0, ended: false }; episodes],
+            moving: Vec::with_capacity(episodes),
+            before: Vec::with_capacity(episodes),
+            config: config.clone(),
+        })
+    }
+
+    fn constants(&self) -> &PointConfig {
+        &self.config
+    }
+
+    fn validate(constants: &PointConfig) -> Result<(), ConfigError> {
+        constants.validate()
+    }
 
     fn episodes(&self) -> usize {
         self.bodies.len()
@@ -222,6 +240,46 @@ impl World for LavaPoint {
 
     fn position(&self, slot: usize) -> [f64; 2] {
         floats(self.bodies[slot].position)
+    }
+
+    fn scene(&self) -> Picture {
+        let PointConfig { arena, lava, goal, start, step_cost, goal_reward, lava_reward, .. } =
+            self.config;
+        let area = |kind, of: Rectangle| Area { kind, min: of.min, max: of.max };
+        Picture {
+            size: arena,
+            cells: false,
+            start,
+            areas: vec![area(AreaKind::Lava, lava), area(AreaKind::Goal, goal)],
+            rules: format!(
+                "A step costs {step_cost}, lava pays {lava_reward} and the goal {goal_reward}, both of \
+                 which end the episode; so does step {}. The noise has a standard deviation of {} m/s.",
+                self.config.horizon, self.config.noise
+            ),
+        }
+    }
+
+    fn state_columns(&self, slot: usize) -> Vec<(&'static str, Field)> {
+        let ([x, y], [vx, vy]) = (self.position(slot), self.velocity(slot));
+        [("x", x), ("y", y), ("vx", vx), ("vy", vy)]
+            .map(|(name, number)| (name, Field::Number(number)))
+            .into()
+    }
+
+    fn action_columns(Force(push): Force) -> Vec<(&'static str, Field)> {
+        vec![("action_x", Field::Number(push.x)), ("action_y", Field::Number(push.y))]
+    }
+
+    fn outcome_columns(xi: Vector2<f64>) -> Vec<(&'static str, Field)> {
+        vec![("xi_x", Field::Number(xi.x)), ("xi_y", Field::Number(xi.y))]
+    }
+
+    fn action_arrow(action: Force) -> [f64; 2] {
+        action.on_disc().into()
+    }
+
+    fn outcome_arrow(xi: Vector2<f64>) -> [f64; 2] {
+        xi.into()
     }
 
     /// # Panics

@@ -24,7 +24,7 @@ pub enum Purpose {
     Bootstrap,
 }
 
-/// The stream of `seed` for a purpose; `index` tells apart the streams of one purpose (for example
+/// The stream of `seed` for a purpose; `index` distinguishes the streams of one purpose (for example
 /// one per episode) and lies below 2^56.
 pub fn stream(seed: u64, purpose: Purpose, index: u64) -> ChaCha8Rng {
     let mut random = ChaCha8Rng::seed_from_u64(seed);
@@ -32,7 +32,7 @@ pub fn stream(seed: u64, purpose: Purpose, index: u64) -> ChaCha8Rng {
     random
 }
 
-/// [`stream`] from a position on, as [`position`] told it.
+/// [`stream`] from a position on that [`position`] reported.
 pub fn stream_from(seed: u64, purpose: Purpose, index: u64, position: u128) -> ChaCha8Rng {
     let mut random = stream(seed, purpose, index);
     random.set_word_pos(position);

@@ -1,9 +1,16 @@
 //! What every world offers: a batch of independent episodes, stepped together.
 
-use crate::error::NoSuchState;
+use crate::action::Action;
+use crate::error::{ConfigError, NoSuchState};
+use crate::finite::FiniteModel;
 use crate::law::Law;
+use crate::scene::{Field, Scene};
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
+use std::fmt::Debug;
+
+/// What chance decides in a world.
+pub type Outcome<W> = <<W as World>::Law as Law>::Outcome;
 
 /// How an episode ended.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
@@ -32,22 +39,61 @@ impl Step {
     pub const IDLE: Step = Step { reward: 0.0, end: None };
 }
 
-/// A batch of episodes of one world, indexed by slot `0..self.episodes()`.
+/// A batch of episodes of one world, indexed by slot `0..self.episodes()`, and all that the rest of the
+/// program must know of that world: its name, its constants with their documentation, what both players
+/// see, and what figures and recordings show of it.
 ///
 /// Slots never influence each other: the episode in a slot is bit for bit what it would be in a
 /// batch of one.
-pub trait World {
-    /// What the protagonist chooses.
-    type Action: Copy + std::fmt::Debug + PartialEq + Send + Sync;
-    /// The nominal law of what chance decides.
+pub trait World: Sized + Send + Sync + 'static {
+    /// The constants.
+    type Constants: Clone + Debug + PartialEq + Serialize + DeserializeOwned + Send + Sync;
+    /// What the protagonist chooses. Its kind decides which policies fit: a
+    /// [`Discrete`](crate::action::Discrete) action is drawn from a categorical one.
+    type Action: Action;
+    /// The nominal law of what chance decides. Its kind decides which families of perturbations fit.
     type Law: Law;
     /// All that the next steps of a slot's episode depend on.
-    type Snapshot: Copy + std::fmt::Debug + PartialEq + Serialize + DeserializeOwned;
+    type Snapshot: Copy + Debug + PartialEq + Serialize + DeserializeOwned + Send;
 
+    /// The name in configurations, folders and tables, such as `lava-grid`.
+    const NAME: &'static str;
+    /// All constants as annotated TOML: the one source of their documentation, defaults and ranges.
+    /// [`World::Constants`] is read from all of them; a configuration lays its changes over this text.
+    const DEFAULTS: &'static str;
+    /// The training options in which this world's defaults differ from the general ones, as
+    /// annotated TOML.
+    const TRAINING: &'static str = "";
+    /// Whether an outcome of chance is an executed action, which [`World::executed`] then gives.
+    const OUTCOMES_ARE_ACTIONS: bool = false;
     /// Length of [`World::observe`]'s vector.
     const OBSERVATION: usize;
     /// Length of [`World::situation`]'s vector.
     const SITUATION: usize;
+
+    /// The default constants, as [`World::DEFAULTS`] has them.
+    ///
+    /// # Panics
+    /// If that text is not the TOML of all constants, which [`conformance`](crate::conformance) checks.
+    fn defaults() -> Self::Constants {
+        toml::from_str(Self::DEFAULTS)
+            .unwrap_or_else(|error| panic!("the defaults of {}: {error}", Self::NAME))
+    }
+
+    /// A batch of `episodes` slots, all in the initial state.
+    ///
+    /// # Errors
+    /// If a constant is out of range.
+    fn new(constants: &Self::Constants, episodes: usize) -> Result<Self, ConfigError>;
+
+    /// The constants of this world.
+    fn constants(&self) -> &Self::Constants;
+
+    /// Checks the constants.
+    ///
+    /// # Errors
+    /// Names the first one that is out of range, its value and the range.
+    fn validate(constants: &Self::Constants) -> Result<(), ConfigError>;
 
     /// Number of slots in the batch.
     fn episodes(&self) -> usize;
@@ -61,7 +107,7 @@ pub trait World {
     /// The state of the slot's episode.
     fn snapshot(&self, slot: usize) -> Self::Snapshot;
 
-    /// Puts the slot into a state of a world with the same constants; the episode goes on from there
+    /// Puts the slot into a state of a world with the same constants; the episode continues from there
     /// bit for bit as it would have where the snapshot was taken.
     ///
     /// # Errors
@@ -88,13 +134,53 @@ pub trait World {
     /// Position of the protagonist, for figures and recordings.
     fn position(&self, slot: usize) -> [f64; 2];
 
+    /// The place where episodes happen, for figures.
+    fn scene(&self) -> Scene;
+
+    /// The constants that results depend on most, in a few words, for the head of a page. Empty by
+    /// default.
+    fn headline(&self) -> String {
+        String::new()
+    }
+
+    /// The slot's state as columns of a recorded step.
+    fn state_columns(&self, slot: usize) -> Vec<(&'static str, Field)>;
+
+    /// An action as columns of a recorded step.
+    fn action_columns(action: Self::Action) -> Vec<(&'static str, Field)>;
+
+    /// An outcome as columns of a recorded step.
+    fn outcome_columns(outcome: Outcome<Self>) -> Vec<(&'static str, Field)>;
+
+    /// An action as an arrow, for pictures.
+    fn action_arrow(action: Self::Action) -> [f64; 2];
+
+    /// An outcome as an arrow, for pictures.
+    fn outcome_arrow(outcome: Outcome<Self>) -> [f64; 2];
+
+    /// The outcome that carries out the action as it was chosen, where there is one.
+    fn intended(_action: Self::Action) -> Option<Outcome<Self>> {
+        None
+    }
+
+    /// The action that the outcome amounts to, where outcomes are executed actions.
+    fn executed(_outcome: Outcome<Self>) -> Option<Self::Action> {
+        None
+    }
+
+    /// The world as a finite model, which exact solvers need; `None` where states or outcomes are
+    /// not finitely many.
+    fn finite(&self) -> Option<&dyn FiniteModel> {
+        None
+    }
+
+    /// The same, to put slots into states.
+    fn finite_mut(&mut self) -> Option<&mut dyn FiniteModel> {
+        None
+    }
+
     /// Carries out one step of every slot: its chosen action and what chance decided. All slices
     /// have length [`World::episodes`]. A slot whose episode has ended stays as it is until it is
     /// reset and reports [`Step::IDLE`].
-    fn apply(
-        &mut self,
-        actions: &[Self::Action],
-        outcomes: &[<Self::Law as Law>::Outcome],
-        steps: &mut [Step],
-    );
+    fn apply(&mut self, actions: &[Self::Action], outcomes: &[Outcome<Self>], steps: &mut [Step]);
 }

@@ -1,7 +1,7 @@
 //! `lava-grid` against tables written by hand, and its map against arbitrary text.
 
 use lava_envs::map::{MAX_CELLS, Map, Tile};
-use lava_envs::{ConfigError, End, GridConfig, LavaGrid, Law, Move, Step, World};
+use lava_envs::{ConfigError, Discrete, End, GridConfig, LavaGrid, Law, Move, Step, World};
 use proptest::prelude::*;
 
 fn grid(picture: &str) -> LavaGrid {
@@ -182,11 +182,17 @@ fn refusals_say_what_where_and_what_to_do() {
 
 #[test]
 fn configurations_are_read_from_toml() {
-    let config: GridConfig = toml::from_str("slip = 0.1\nmap = '''\n  S.\n  LG\n'''").unwrap();
+    let changed = LavaGrid::DEFAULTS.replace("slip = 0.05", "slip = 0.1");
+    let config: GridConfig = toml::from_str(&changed).unwrap();
     assert_eq!((config.slip, config.horizon), (0.1, 40));
+    let config = GridConfig { map: "\n  S.\n  LG\n".into(), ..config };
     assert_eq!(LavaGrid::new(&config, 1).unwrap().map().to_string(), "S.\nLG\n");
-    let unknown = toml::from_str::<GridConfig>("slipp = 0.1").unwrap_err();
+    let unknown = format!("slipp = 0.1\n{changed}");
+    let unknown = toml::from_str::<GridConfig>(&unknown).unwrap_err();
     assert!(unknown.to_string().contains("slipp"), "{unknown}");
+    let missing = changed.replace("slip = 0.1", "");
+    let missing = toml::from_str::<GridConfig>(&missing).unwrap_err();
+    assert!(missing.to_string().contains("slip"), "{missing}");
     let text = toml::to_string(&GridConfig::default()).unwrap();
     assert_eq!(toml::from_str::<GridConfig>(&text).unwrap(), GridConfig::default());
 }

@@ -284,7 +284,7 @@ fn planned(world: &LavaPoint, slot: usize) -> Force {
     Force((error * 3.0 - velocity) / 2.5)
 }
 
-/// Returns of the planned controller; the noise of an episode depends on its number alone.
+/// Returns of the planned controller; the noise of an episode depends only on its number.
 fn returns(config: &PointConfig, episodes: usize) -> Vec<f64> {
     let mut world = LavaPoint::new(config, episodes).unwrap();
     let mut random: Vec<ChaCha8Rng> =
@@ -415,11 +415,16 @@ fn refusals_name_field_value_and_range() {
 
 #[test]
 fn configurations_are_read_from_toml() {
-    let config: PointConfig =
-        toml::from_str("noise = 1.0\nlava = { min = [3, 0], max = [8, 2] }").unwrap();
-    assert_eq!((config.noise, config.lava.min, config.horizon), (1.0, [3.0, 0.0], 40));
-    assert!(toml::from_str::<PointConfig>("gravity = 9.81").is_err());
-    assert!(toml::from_str::<PointConfig>("lava = { min = [3, 0], max = [8, 2], x = 1 }").is_err());
+    let changed = |from: &str, to: &str| {
+        assert!(LavaPoint::DEFAULTS.contains(from), "{from}");
+        toml::from_str::<PointConfig>(&LavaPoint::DEFAULTS.replace(from, to))
+    };
+    let config = changed("noise = 1.5", "noise = 1").unwrap();
+    assert_eq!((config.noise, config.lava.min, config.horizon), (1.0, [2.0, 0.0], 40));
+    assert_eq!(changed("min = [2.0, 0.0]", "min = [3, 0]").unwrap().lava.min, [3.0, 0.0]);
+    assert!(changed("horizon = 40", "").is_err());
+    assert!(changed("horizon = 40", "horizon = 40\ngravity = 9.81").is_err());
+    assert!(changed("min = [2.0, 0.0]", "min = [2.0, 0.0]\nx = 1").is_err());
     let text = toml::to_string(&PointConfig::default()).unwrap();
     assert_eq!(toml::from_str::<PointConfig>(&text).unwrap(), PointConfig::default());
 }

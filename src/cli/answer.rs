@@ -6,7 +6,7 @@ use std::fmt::Display;
 use std::io::{self, Write};
 use std::process::ExitCode;
 
-/// Prints an answer for people or, on one line, for programs.
+/// Prints an answer as text or, for programs, as JSON on one line.
 ///
 /// # Errors
 /// If standard output cannot be written to.
@@ -22,7 +22,7 @@ pub fn print_json(answer: &impl Serialize) -> Result<ExitCode> {
     print(&serde_json::to_string(answer)?)
 }
 
-/// Prints a text. A reader that has heard enough (`| head`) is no error.
+/// Prints a text. It is not an error if the reader closes the pipe early (`| head`).
 ///
 /// # Errors
 /// If standard output cannot be written to.

@@ -12,7 +12,7 @@ use super::policy::Policy;
 use crate::game::returns::{Atom, ReturnLaw};
 use lava_envs::End;
 
-/// An antagonist that reweights chance by the node and the action alone.
+/// An antagonist that reweights chance only by the node and the action.
 pub trait Perturbation {
     /// The likelihood ratio delta_t(o), not negative and of mean 1 under P(o|s,a).
     fn ratio(&self, node: Node, action: usize, outcome: usize) -> f64;

@@ -1,7 +1,7 @@
 //! Finite MDPs with a time limit, and the accumulated reward as part of their state.
 //!
 //! Risk criteria of the return `J = sum_{t=0}^{T-1} gamma^t r_t` are not solved by policies over
-//! (s, t) alone: the accumulated reward `R_t = sum_{k<t} gamma^k r_k` must be known too (Baeuerle &
+//! (s, t): the accumulated reward `R_t = sum_{k<t} gamma^k r_k` must be known too (Baeuerle &
 //! Ott 2011, "Markov decision processes with average-value-at-risk criteria"). [`FiniteMdp`]
 //! therefore lists, per time t, the values that R_t takes while the episode runs, its *levels*, and
 //! everything in this module is solved over nodes (t, level, s), see [`Node`].
@@ -43,7 +43,7 @@ pub struct Outcome {
 /// A state of a [`FiniteMdp`].
 #[derive(Debug, Clone, PartialEq)]
 pub enum State {
-    /// The episode goes on: the outcomes of each action.
+    /// The episode continues: the outcomes of each action.
     Running(Vec<Vec<Outcome>>),
     /// The episode has ended so.
     Ended(End),
@@ -343,7 +343,7 @@ impl FiniteMdp {
         self.gamma
     }
 
-    /// How the episode has ended in a state; `None` where it goes on.
+    /// How the episode has ended in a state; `None` where it continues.
     pub fn ended(&self, state: usize) -> Option<End> {
         self.ends[state]
     }
@@ -365,6 +365,11 @@ impl FiniteMdp {
         Outcome { probability: branch.probability, reward: landing.reward, next: landing.state }
     }
 
+    /// Whether the time says what has been accumulated: every time has one level.
+    pub fn one_level(&self) -> bool {
+        self.blocks == self.horizon
+    }
+
     /// The values of the accumulated reward R_t, t in 0..T, ascending; their indices are the levels.
     /// Some may be out of reach from the start.
     pub fn accumulated(&self, time: usize) -> &[Accumulated] {
@@ -377,7 +382,7 @@ impl FiniteMdp {
         self.next_node(node.time, node.level, branch.landing as usize)
     }
 
-    /// How the episode ends with an outcome, and its return J; `None` if it goes on.
+    /// How the episode ends with an outcome, and its return J; `None` if it continues.
     pub fn ending(&self, node: Node, action: usize, outcome: usize) -> Option<(End, f64)> {
         let branch = self.branches(self.pairs[node.state] + action)[outcome];
         let landing = branch.landing as usize;
@@ -450,7 +455,7 @@ impl FiniteMdp {
         self.return_indices[self.block(time, level) * self.landings.len() + landing] as usize
     }
 
-    /// Level at `time + 1` after a landing with which the episode goes on.
+    /// Level at `time + 1` after a landing with which the episode continues.
     pub(super) fn next_level(&self, time: usize, level: usize, landing: usize) -> usize {
         let layer = &self.layers[time];
         layer.next[level * self.rewards + self.landings[landing].reward_index] as usize
@@ -465,8 +470,8 @@ impl FiniteMdp {
     }
 }
 
-/// Bits whose order as integers is the order of the numbers, so that sums can be sorted and told
-/// apart exactly. Both zeros are one.
+/// Bits whose order as integers is the order of the numbers, so that sums can be sorted and
+/// distinguished exactly. Both zeros are one.
 fn ordered(value: f64) -> u64 {
     let bits = (value + 0.0).to_bits();
     if bits >> 63 == 1 { !bits } else { bits | (1 << 63) }

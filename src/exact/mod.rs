@@ -1,4 +1,4 @@
-//! Exact yardsticks: what the right answer is on a finite world, without sampling and without torch.
+//! Exact yardsticks: the right answer on a finite world, without sampling and without networks.
 //!
 //! | question | file |
 //! |---|---|
@@ -9,8 +9,10 @@
 //! | what would the budget-augmented programme report | [`chow`] |
 //! | how good can a policy without a clock be | [`stationary`] |
 //! | how far is a trained policy from the optimum | [`certificate`] |
-//! | all of it on the grid | [`grid`] |
+//! | what is a policy of any method to an exact solver | [`table`] |
+//! | all of it in any finite world | [`finite`] |
 //! | what can be attained certifiably on the point mass, where nothing is exact | [`oracle`] |
+//! | all of it for any world, by one interface | [`yardstick`] |
 //!
 //! Symbols: budget eta >= 1, risk level alpha = 1/eta, return J, threshold w, time t, state s, outcome
 //! of chance o, perturbation delta_t(o). Rewards and returns are in the world's reward units.
@@ -18,13 +20,15 @@
 pub mod antagonist;
 pub mod certificate;
 pub mod chow;
-pub mod grid;
+pub mod finite;
 pub mod law;
 pub mod mdp;
 pub mod optimum;
 pub mod oracle;
 pub mod policy;
 pub mod stationary;
+pub mod table;
+pub mod yardstick;
 
 /// Why a yardstick cannot be computed.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
@@ -45,7 +49,7 @@ pub enum ExactError {
         mdp::MAX_NODES
     )]
     TooLarge,
-    /// Action probabilities that are none.
+    /// Action probabilities that are no law.
     #[error("the action probabilities {row:?} of state {state} are no law")]
     Policy {
         /// The state.
@@ -53,10 +57,27 @@ pub enum ExactError {
         /// What was given.
         row: Vec<f64>,
     },
+    /// A table of action probabilities of the wrong shape.
+    #[error("a table of {found:?} times, states and actions does not fit a world of {expected:?}")]
+    Table {
+        /// Times, states and actions of the table.
+        found: [usize; 3],
+        /// Those of the world.
+        expected: [usize; 3],
+    },
+    /// The exact worst-case antagonist depends on the reward accumulated so far.
+    #[error(
+        "the exact worst-case antagonist of {0} depends on the reward accumulated so far, which time \
+         and state do not say"
+    )]
+    Levels(&'static str),
     /// The exact worst-case antagonist exists for deterministic policies only.
     #[error("the exact worst-case antagonist is defined for deterministic policies only")]
     Stochastic,
-    /// The grid's configuration is out of range.
+    /// The world has no finite model.
+    #[error("{0} has no finite model: its states, actions or outcomes are not finitely many")]
+    NotFinite(&'static str),
+    /// The world's constants are out of range.
     #[error(transparent)]
     Config(#[from] lava_envs::ConfigError),
 }

@@ -16,7 +16,7 @@
 //!
 //!   G(w) >= max(G(w_1), G(w_2) - (w_2 - w)),   therefore   F(w) <= w - that/alpha.
 //!
-//! Below the first evaluated candidate G >= 0 stands in for G(w_1). An interval between evaluated
+//! Below the first evaluated candidate G >= 0 takes the place of G(w_1). An interval between evaluated
 //! candidates is dropped when the bound of each candidate in it lies below the best F found by more
 //! than [`TIE`].
 //!
@@ -191,7 +191,7 @@ impl<'a> Shortfall<'a> {
 }
 
 /// Fills the value after each landing: `at_end` by return where the episode ends, `next` by level and
-/// state where it goes on.
+/// state where it continues.
 pub(super) fn land(
     mdp: &FiniteMdp,
     time: usize,
@@ -271,8 +271,8 @@ fn is_better(candidate: (f64, f64), best: (f64, f64)) -> bool {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::exact::grid::ExactGrid;
-    use lava_envs::GridConfig;
+    use crate::exact::finite::ExactWorld;
+    use lava_envs::{GridConfig, LavaGrid};
 
     #[test]
     fn leaving_out_thresholds_loses_nothing() {
@@ -282,7 +282,7 @@ mod tests {
             GridConfig { slip: 0.0, step_cost: 0.0, ..GridConfig::default() },
         ];
         for (config, gamma) in configs.iter().zip([1.0, 0.95, 0.9]) {
-            let exact = ExactGrid::new(config, gamma).unwrap();
+            let exact = ExactWorld::<LavaGrid>::new(config, gamma).unwrap();
             let mdp = exact.mdp();
             let mut programme = Shortfall::new(mdp);
             let shortfalls: Vec<f64> = mdp.returns().iter().map(|&w| programme.least(w)).collect();

@@ -33,6 +33,7 @@ use super::{ExactError, require_eta};
 use crate::files::write_in_place;
 use crate::game::returns::ReturnLaw;
 use controller::{Controller, Scripted};
+use etcetera::base_strategy::{BaseStrategy as _, Xdg};
 use lattice::Space;
 use lava_envs::{ConfigError, End, PointConfig};
 use play::{Played, play};
@@ -379,7 +380,7 @@ fn choose(
     let mut best: Option<(f64, Controller, f64)> = None;
     let candidates = ranked.iter().take(effort.candidates.max(1));
     for &w in candidates {
-        // One table at a time beside the best one.
+        // One table at a time besides the best one.
         let controller = Controller::new(space.clone(), rewards, Utility::Shortfall(w), threads);
         let law = if effort.candidates > 1 {
             play(config, gamma, &controller, effort.selection_episodes, SELECTION_SEED, threads)?
@@ -428,12 +429,10 @@ fn rank(thresholds: &[f64], mut value: impl FnMut(f64) -> f64) -> Vec<f64> {
     ranked.into_iter().map(|(_, index)| thresholds[index]).collect()
 }
 
-/// The user's cache folder of certificates; `None` if the environment names none.
+/// The user's cache folder of certificates by the XDG specification; `None` for a user without a home.
 pub fn cache_folder() -> Option<PathBuf> {
-    let absolute =
-        |name: &str| std::env::var_os(name).map(PathBuf::from).filter(|path| path.is_absolute());
-    let base = absolute("XDG_CACHE_HOME").or_else(|| Some(absolute("HOME")?.join(".cache")))?;
-    Some(base.join("cvar-game").join("oracle"))
+    let base = Xdg::new().ok()?.cache_dir();
+    base.is_absolute().then(|| base.join("cvar-game").join("oracle"))
 }
 
 /// All that a certificate depends on.
@@ -524,7 +523,7 @@ fn file_of(key: &str, folder: &Path) -> PathBuf {
     folder.join(format!("{:016x}.json", fnv(key.as_bytes())))
 }
 
-/// FNV-1a; a file name, whose entry tells its whole key.
+/// FNV-1a; a file name, whose entry contains its whole key.
 fn fnv(bytes: &[u8]) -> u64 {
     bytes.iter().fold(0xcbf2_9ce4_8422_2325, |hash, &byte| {
         (hash ^ u64::from(byte)).wrapping_mul(0x0000_0100_0000_01b3)

@@ -4,7 +4,7 @@
 use super::ExactError;
 use super::mdp::{FiniteMdp, Node};
 
-/// What a policy takes into account beside the state.
+/// What a policy takes into account besides the state.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Memory {
     /// Nothing: pi(a|s).
@@ -26,7 +26,7 @@ pub struct Policy {
 }
 
 impl Policy {
-    /// A policy that sees the state alone. `fill(state, row)` writes the probabilities of the
+    /// A policy that sees only the state. `fill(state, row)` writes the probabilities of the
     /// state's actions; rows come zeroed, and states whose episode has ended are left out.
     ///
     /// # Errors
@@ -65,7 +65,7 @@ impl Policy {
         })
     }
 
-    /// A deterministic policy that sees the state alone; `choose` gives the action of a state.
+    /// A deterministic policy that sees only the state; `choose` gives the action of a state.
     ///
     /// # Panics
     /// If the state has no such action.
@@ -117,7 +117,7 @@ impl Policy {
         greedy
     }
 
-    /// What the policy takes into account beside the state.
+    /// What the policy takes into account besides the state.
     pub fn memory(&self) -> Memory {
         self.memory
     }
@@ -178,12 +178,13 @@ impl Policy {
     }
 }
 
-/// States in which the episode goes on.
+/// States in which the episode continues.
 fn running(mdp: &FiniteMdp) -> impl Iterator<Item = usize> + use<'_> {
     (0..mdp.states()).filter(|&state| mdp.ended(state).is_none())
 }
 
-fn likeliest(row: &[f64]) -> usize {
+/// The first of the largest probabilities.
+pub(super) fn likeliest(row: &[f64]) -> usize {
     let mut best = 0;
     for (action, &probability) in row.iter().enumerate() {
         if probability > row[best] {

@@ -286,7 +286,7 @@ impl<'a> Search<'a> {
     }
 }
 
-/// Calls back with the probability of each node in which the episode goes on.
+/// Calls back with the probability of each node in which the episode continues.
 fn for_visits(mdp: &FiniteMdp, policy: &Policy, mut visit: impl FnMut(Node, f64)) {
     forward(
         mdp,

@@ -1,6 +1,6 @@
-//! What a run leaves behind, and where.
+//! The files that a run writes, and where.
 //!
-//! A run `ENV/eta-E/seed-N` owns one folder:
+//! A run `WORLD/METHOD/eta-E/seed-N` owns one folder:
 //!
 //! | file | what |
 //! |---|---|
@@ -8,19 +8,21 @@
 //! | `manifest.json` | [`Manifest`]: where the run comes from |
 //! | `progress.csv` | one line per update of a player |
 //! | `events.out.tfevents.cvar-game` | the same for TensorBoard ([`super::tensorboard`]) |
-//! | `final.safetensors` | weights of both players at the end, never the best |
-//! | `exhibits.json` | [`super::exhibits`]: what figures need beyond numbers |
-//! | `checkpoint-<update>.bin` | what an unfinished run goes on from, see [`super::checkpoint`] |
+//! | `final.safetensors` | weights of both players at the end, not the best ones |
+//! | `figure_data.json` | [`super::figure_data`]: what figures need beyond numbers |
+//! | `checkpoint-<update>.bin` | what an unfinished run continues from, see [`super::checkpoint`] |
 //! | `evaluation.json` | [`Evaluation`]; written last, so that a run with it is finished |
 
 use super::names::RunId;
+use crate::exact::yardstick::Comparison;
 use crate::game::returns::ReturnLaw;
+use crate::learn::policy::Mode;
 use serde::{Deserialize, Serialize};
 
-/// Version of the on-disk formats. A folder with another one is refused, never overwritten.
+/// Version of the on-disk formats. A folder with another one is refused and not overwritten.
 pub const SCHEMA: u32 = 1;
 
-/// Mark of the sources that this program is built from.
+/// Mark of all on which the bits of training depend: sources, crates, compiler and target (see `build.rs`).
 pub const BUILD: &str = env!("CVAR_GAME_BUILD");
 
 /// Where a run comes from: all that is needed to repeat it.
@@ -28,14 +30,16 @@ pub const BUILD: &str = env!("CVAR_GAME_BUILD");
 pub struct Manifest {
     /// Version of the on-disk formats.
     pub schema: u32,
-    /// `ENV/eta-E/seed-N`.
+    /// `WORLD/METHOD/eta-E/seed-N`.
     pub run: String,
     /// Version of the program.
     pub version: String,
     /// Commit of the source, if the program was built in a checkout.
     pub commit: Option<String>,
-    /// Version of libtorch: the one that tch is made for, as its build refuses any other.
-    pub libtorch: String,
+    /// Version of libtorch: the one that tch is made for, as its build refuses any other; `None` for a
+    /// program without it.
+    #[serde(default)]
+    pub libtorch: Option<String>,
     /// Device of the networks.
     pub device: String,
     /// Model name of the processor.
@@ -44,19 +48,19 @@ pub struct Manifest {
     pub seconds: f64,
     /// Environment steps of training.
     pub steps: u64,
-    /// Set when the run failed; says at which update, which player and which quantity.
+    /// Set when the run failed: the update, the player and the quantity.
     pub failure: Option<String>,
 }
 
 impl Manifest {
     /// The manifest of a run of this program on this machine.
-    pub fn of(run: RunId, device: &str, steps: u64, seconds: f64) -> Self {
+    pub fn of(run: &RunId, device: &str, steps: u64, seconds: f64) -> Self {
         Manifest {
             schema: SCHEMA,
             run: run.to_string(),
             version: env!("CARGO_PKG_VERSION").to_owned(),
             commit: option_env!("CVAR_GAME_COMMIT").map(str::to_owned),
-            libtorch: "2.13.0".to_owned(),
+            libtorch: cfg!(feature = "torch").then(|| "2.13.0".to_owned()),
             device: device.to_owned(),
             cpu: processor(),
             seconds,
@@ -66,32 +70,23 @@ impl Manifest {
     }
 }
 
-/// Model name of the processor, where the system tells.
+/// Model name of the processor, where the system provides it.
 fn processor() -> String {
     let text = std::fs::read_to_string("/proc/cpuinfo").unwrap_or_default();
     let model = text.lines().find_map(|line| line.strip_prefix("model name"));
     model.map_or("unknown", |name| name.trim_start_matches([' ', '\t', ':'])).to_owned()
 }
 
-/// How a protagonist picks its action.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "kebab-case")]
-pub enum Mode {
-    /// The mode of its policy.
-    Greedy,
-    /// A draw from its policy.
-    Sampled,
-}
-
 /// Who decides the law of chance.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, clap::ValueEnum)]
 #[serde(rename_all = "kebab-case")]
 pub enum Chance {
-    /// The nominal law.
+    /// No one: chance follows its nominal law.
     Nominal,
-    /// The learned antagonist.
+    /// The antagonist that was trained with the protagonist.
+    #[value(name = "learned")]
     Antagonist,
-    /// The exact worst-case antagonist of the greedy protagonist.
+    /// The exact worst case for the greedy protagonist (finite worlds, such as lava-grid).
     Exact,
 }
 
@@ -102,7 +97,7 @@ pub struct Play {
     pub protagonist: Mode,
     /// Who decided the law of chance.
     pub chance: Chance,
-    /// Whether `law` is exact or of recorded episodes is told by its `episodes`.
+    /// Whether `law` is exact or of recorded episodes follows from its `episodes`.
     pub law: ReturnLaw,
     /// Mean over episodes of the least distance to lava; `None` where it was not recorded.
     pub mean_clearance: Option<f64>,
@@ -111,11 +106,11 @@ pub struct Play {
 /// The budget audit (paper Eq. 5) over recorded trajectories.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Audit {
-    /// Trajectories looked at.
+    /// Trajectories audited.
     pub trajectories: u64,
     /// max prod delta / eta over all trajectories; at most 1.
     pub max_budget_use: f64,
-    /// max |`E_P[delta_t]` - 1| over all steps looked at.
+    /// max |`E_P[delta_t]` - 1| over all steps audited.
     pub max_normalisation_error: f64,
     /// Steps or trajectories beyond tolerance.
     pub violations: u64,
@@ -146,6 +141,29 @@ pub struct Certificate {
     pub antagonist_gap_standard_error: f64,
 }
 
+impl From<Comparison> for Certificate {
+    fn from(found: Comparison) -> Self {
+        Certificate {
+            optimum: found.optimum,
+            regret: found.regret,
+            regret_standard_error: found.regret_standard_error,
+            antagonist_gap: found.antagonist_gap,
+            antagonist_gap_standard_error: found.antagonist_gap_standard_error,
+        }
+    }
+}
+
+/// What the evaluation protocol finds of trained players.
+#[derive(Debug)]
+pub struct Findings {
+    /// Greedy and sampled, nominal and (where there is one) under the antagonist.
+    pub plays: Vec<Play>,
+    /// The budget audit; `None` without an antagonist.
+    pub audit: Option<Audit>,
+    /// Certificates where the world has a yardstick.
+    pub certificate: Option<Certificate>,
+}
+
 /// What the evaluation protocol found of a finished run.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Evaluation {
@@ -170,6 +188,22 @@ pub struct Evaluation {
 }
 
 impl Evaluation {
+    /// The results of a run, with its steps and seconds of training.
+    pub fn new(run: &RunId, (steps, seconds): (u64, f64), found: Findings) -> Self {
+        let Findings { plays, audit, certificate } = found;
+        Evaluation {
+            schema: SCHEMA,
+            env: run.world.to_string(),
+            eta: run.eta.get(),
+            seed: run.seed,
+            steps,
+            seconds,
+            plays,
+            audit,
+            certificate,
+        }
+    }
+
     /// The play of this kind.
     pub fn play(&self, protagonist: Mode, chance: Chance) -> Option<&Play> {
         self.plays.iter().find(|play| play.protagonist == protagonist && play.chance == chance)

@@ -1,4 +1,4 @@
-//! Checkpoints: what a run that was cut short goes on from.
+//! Checkpoints: what a run that was cut short continues from.
 //!
 //! A run's folder keeps the last two as `checkpoint-<update>.bin`, written in one piece. A file is
 //!
@@ -9,12 +9,12 @@
 //! | 12..16 | CRC-32 of the payload |
 //! | 16.. | the payload: a [`Checkpoint`] as postcard |
 //!
-//! A file that is damaged or belongs to another run is passed over for the one before it. The sizes
-//! of all parts are checked against the run, so a file from elsewhere can at worst be refused.
+//! A file that is damaged or belongs to another run is skipped for the one before it. The sizes
+//! of all parts are checked against the run, so a foreign file is refused and does no harm.
 
 use super::artefacts::SCHEMA;
+use super::progress_file::ProgressExtent;
 use crate::files::{read_at_most, write_in_place};
-use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 use std::fs;
 use std::io;
@@ -22,43 +22,34 @@ use std::path::{Path, PathBuf};
 
 const MAGIC: &[u8; 8] = b"CVARGAME";
 const HEADER: usize = 16;
-/// Larger files are refused unread: the largest configuration stays far below.
+/// Larger files are refused unread: the largest configuration needs far less.
 const LARGEST: u64 = 1 << 30;
 /// Checkpoints that are kept: if the last one is damaged there is one before it.
 const KEPT: usize = 2;
 
-/// Everything that a run goes on from; `T` is the state of its training.
+/// Everything that a run continues from.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub struct Checkpoint<T> {
+pub struct Checkpoint {
     /// [`super::artefacts::BUILD`] of its program: another one might end with other bits.
     pub program: String,
     /// The run's `config.toml`.
     pub config: String,
     /// Seconds of training so far.
     pub seconds: f64,
-    /// How much of `progress.csv` belongs to it.
-    pub progress: Extent,
-    /// State of training.
-    pub training: T,
+    /// How much of `progress.csv` and of the event file belongs to it.
+    pub progress: ProgressExtent,
+    /// State of training, in the method's own format.
+    pub training: Vec<u8>,
 }
 
-/// The beginning of a file: its length and its CRC-32.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-pub struct Extent {
-    /// Bytes.
-    pub bytes: u64,
-    /// CRC-32 of these bytes.
-    pub crc: u32,
-}
-
-/// Why a file is no checkpoint to go on from.
+/// Why a run cannot continue from a file.
 #[derive(Debug, thiserror::Error)]
 pub enum CheckpointError {
     /// It cannot be read.
     #[error("cannot be read ({0})")]
     Read(#[from] io::Error),
-    /// It is none, or cut short.
-    #[error("is no checkpoint")]
+    /// It is not a checkpoint, or was cut short.
+    #[error("is not a checkpoint")]
     Foreign,
     /// It has another schema version.
     #[error("has schema version {0}, this program reads {SCHEMA}")]
@@ -75,7 +66,7 @@ pub enum CheckpointError {
 ///
 /// # Errors
 /// If its state cannot be represented.
-pub fn to_bytes<T: Serialize>(checkpoint: &Checkpoint<T>) -> io::Result<Vec<u8>> {
+pub fn to_bytes(checkpoint: &Checkpoint) -> io::Result<Vec<u8>> {
     let mut bytes = vec![0; HEADER];
     bytes = postcard::to_extend(checkpoint, bytes).map_err(io::Error::other)?;
     let crc = crc32fast::hash(&bytes[HEADER..]);
@@ -88,8 +79,8 @@ pub fn to_bytes<T: Serialize>(checkpoint: &Checkpoint<T>) -> io::Result<Vec<u8>>
 /// The checkpoint in the bytes of a file.
 ///
 /// # Errors
-/// If they are none.
-pub fn from_bytes<T: DeserializeOwned>(bytes: &[u8]) -> Result<Checkpoint<T>, CheckpointError> {
+/// If they are not a checkpoint.
+pub fn from_bytes(bytes: &[u8]) -> Result<Checkpoint, CheckpointError> {
     let (header, payload) = bytes.split_at_checked(HEADER).ok_or(CheckpointError::Foreign)?;
     let number = |at: usize| {
         header[at..].first_chunk().map_or(0, |bytes: &[u8; 4]| u32::from_le_bytes(*bytes))
@@ -109,15 +100,11 @@ pub fn from_bytes<T: DeserializeOwned>(bytes: &[u8]) -> Result<Checkpoint<T>, Ch
     }
 }
 
-/// Writes the checkpoint after `update` and removes those that it makes needless.
+/// Writes the checkpoint after `update` and removes those that are no longer needed.
 ///
 /// # Errors
 /// If the folder cannot be written.
-pub fn save<T: Serialize>(
-    folder: &Path,
-    update: u64,
-    checkpoint: &Checkpoint<T>,
-) -> io::Result<()> {
+pub fn save(folder: &Path, update: u64, checkpoint: &Checkpoint) -> io::Result<()> {
     write_in_place(&folder.join(format!("checkpoint-{update}.bin")), &to_bytes(checkpoint)?)?;
     list(folder)?.iter().skip(KEPT).try_for_each(fs::remove_file)
 }
@@ -125,8 +112,8 @@ pub fn save<T: Serialize>(
 /// The checkpoint in a file.
 ///
 /// # Errors
-/// If the file cannot be read or is none.
-pub fn load<T: DeserializeOwned>(path: &Path) -> Result<Checkpoint<T>, CheckpointError> {
+/// If the file cannot be read or is not a checkpoint.
+pub fn load(path: &Path) -> Result<Checkpoint, CheckpointError> {
     from_bytes(&read_at_most(path, LARGEST)?)
 }
 

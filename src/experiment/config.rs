@@ -1,48 +1,58 @@
 //! Configuration: what an experiment runs, every number of it with its range.
 //!
-//! Layers, each winning over the one before: the embedded `configs/default.toml`, a file, `--set
-//! key=value` in the order given. The default names every key there is; any other key is refused.
+//! Layers, each winning over the one before: the default, a file after the files that it extends, the
+//! variant of the experiment, `--set key=value` in the order given. The default has every key;
+//! any other key is refused. It is the embedded `configs/default.toml` with a section of each world
+//! and method of the [`Catalogue`], and its text is also the documentation and the range of every key.
 //! The training options of one world come from `[train]` and from its own `[env.WORLD.train]`, layer
 //! by layer:
 //!
 //! ```text
-//! default [train] < default [env.W.train] < file [train] < file [env.W.train] < --set ...
+//! default [train] < default [env.W.train] < file [train] < file [env.W.train] < variant < --set ...
 //! ```
 //!
-//! so that a later layer always wins and, within a layer, the world's own section does. `--set
-//! env.KEY=value`, where KEY starts with no world's name, is short for that key in every selected
-//! world that has it.
+//! so that a later layer always wins and, within a layer, the world's own section does. `env.KEY`,
+//! where KEY does not begin with a world's name, means that key in every selected world that has it;
+//! `--set` and variants may use it.
+//!
+//! | question | module |
+//! |---|---|
+//! | which worlds and methods are there | [`catalogue`] |
+//! | how is the annotated default read | `annotated`, `rules` |
+//! | which layer wins | `layers` |
+//! | what are variants and axes | `variants` |
+//! | what does one run's `config.toml` hold | `run`, `constants` |
 
+mod annotated;
+pub mod catalogue;
+mod conflicts;
+mod constants;
+mod keys;
 mod layers;
+mod renamed;
 mod rules;
+mod run;
+mod variants;
 
 use super::artefacts::SCHEMA;
-use super::names::{RunId, WorldName};
+use super::names::{MethodName, RunId, VariantName, WorldName};
+use crate::exact::yardstick;
 use crate::game::budget::Eta;
-use crate::options::{Credit, TrainOptions};
-use lava_envs::{grid::GridConfig, point::PointConfig};
+use crate::learn::device::Device;
+use crate::learn::options::TrainOptions;
 use layers::Layer;
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
-use std::fmt;
 use std::path::{Path, PathBuf};
-use std::str::FromStr;
 use thiserror::Error;
 use toml::{Table, Value};
 
+pub use annotated::OptionInfo;
+pub use catalogue::{Catalogue, MethodInfo, WorldInfo};
+pub use constants::WorldConstants;
 pub use layers::Setting;
-
-/// The annotated default configuration: the documentation of every option, and the list of all keys.
-pub const DEFAULT: &str = include_str!("../../configs/default.toml");
-
-/// The constants of a world in the default configuration, with their comments.
-pub fn default_constants(world: WorldName) -> &'static str {
-    let comment_above = |at: usize| DEFAULT[..at].rfind("\n\n").map_or(0, |blank| blank + 2);
-    let start = DEFAULT.find(&format!("[env.{world}]")).map_or(0, comment_above);
-    let end = DEFAULT.find(&format!("[env.{world}.train]")).map_or(DEFAULT.len(), comment_above);
-    &DEFAULT[start..end - 1]
-}
+pub use run::{Difference, RunConfig};
 
 /// What is wrong with a configuration, in one line.
 #[derive(Debug, Error)]
@@ -69,14 +79,32 @@ pub enum ConfigError {
         /// What was given.
         setting: String,
     },
-    /// A key that the default configuration has not.
+    /// A file's `extends` that cannot be followed.
+    #[error("{origin}: extends: {what}")]
+    Extends {
+        /// The file.
+        origin: String,
+        /// What is wrong.
+        what: String,
+    },
+    /// A name that the catalogue does not have.
+    #[error("there is no {kind} {name:?}; the {kind}s are {known}")]
+    UnknownName {
+        /// `world` or `method`.
+        kind: &'static str,
+        /// The name.
+        name: String,
+        /// The names there are.
+        known: String,
+    },
+    /// A key that the default configuration does not have.
     #[error("unknown key {key} (from {origin}); {advice}")]
     UnknownKey {
         /// The dotted key.
         key: String,
         /// The file or option that has it.
         origin: String,
-        /// The nearest known key, or where all keys are listed.
+        /// Its present name, the nearest known key, or where all keys are listed.
         advice: String,
     },
     /// A value of the wrong type or outside its range.
@@ -91,7 +119,7 @@ pub enum ConfigError {
         /// What it may be.
         allowed: String,
     },
-    /// Values that are fine each and impossible together.
+    /// Values that are each in range and impossible together.
     #[error("{0}")]
     Conflict(String),
     /// A constant of a world that the world refuses.
@@ -99,7 +127,7 @@ pub enum ConfigError {
     World {
         /// The world.
         world: WorldName,
-        /// What it says; begins with the constant's name.
+        /// Its message, which begins with the constant's name.
         message: String,
     },
     /// A run's `config.toml` of another version of the program.
@@ -115,60 +143,14 @@ pub enum ConfigError {
     },
 }
 
-/// The device that the networks are on.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
-#[serde(into = "String", try_from = "String")]
-pub enum Device {
-    /// The processor.
-    #[default]
-    Cpu,
-    /// A CUDA device by its number.
-    Cuda(usize),
-}
-
-impl fmt::Display for Device {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        match self {
-            Device::Cpu => f.write_str("cpu"),
-            Device::Cuda(0) => f.write_str("cuda"),
-            Device::Cuda(number) => write!(f, "cuda:{number}"),
-        }
-    }
-}
-
-impl FromStr for Device {
-    type Err = String;
-
-    fn from_str(text: &str) -> Result<Self, String> {
-        let number = match text {
-            "cpu" => return Ok(Device::Cpu),
-            "cuda" => Some(0),
-            _ => text.strip_prefix("cuda:").and_then(|number| number.parse().ok()),
-        };
-        number.map(Device::Cuda).ok_or_else(|| format!("device {text:?} is not {}", rules::DEVICE))
-    }
-}
-
-impl From<Device> for String {
-    fn from(device: Device) -> Self {
-        device.to_string()
-    }
-}
-
-impl TryFrom<String> for Device {
-    type Error = String;
-
-    fn try_from(text: String) -> Result<Self, String> {
-        text.parse()
-    }
-}
-
-/// The runs of a sweep: every world with every eta and every seed.
+/// The runs of a sweep: every world with every method, every eta and every seed.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Experiment {
     /// Worlds.
     pub envs: Vec<WorldName>,
+    /// Methods of training.
+    pub methods: Vec<MethodName>,
     /// Budgets.
     pub etas: Vec<Eta>,
     /// Seeds, declared in advance.
@@ -197,8 +179,8 @@ pub struct EvaluationOptions {
     pub alphas: Vec<f64>,
     /// Episodes played against the antagonist for the figures; runs of former versions have no such
     /// key.
-    #[serde(default = "exhibit_episodes")]
-    pub exhibit_episodes: u64,
+    #[serde(default = "figure_episodes")]
+    pub figure_episodes: u64,
     /// What lava-point's regret is measured against; runs of former versions have no such key.
     #[serde(default)]
     pub oracle: Oracle,
@@ -211,74 +193,38 @@ pub enum Oracle {
     /// From the program, which has those of the default world; no regret elsewhere.
     #[default]
     Shipped,
-    /// Computed where it is not known, which takes minutes.
+    /// Computed where the program does not have it, which takes minutes.
     Computed,
 }
 
-/// The default of [`EvaluationOptions::exhibit_episodes`].
-fn exhibit_episodes() -> u64 {
+impl EvaluationOptions {
+    /// How the yardstick of a run is computed.
+    pub fn yardstick(&self) -> yardstick::Options {
+        let source = match self.oracle {
+            Oracle::Shipped => yardstick::Source::Shipped,
+            Oracle::Computed => yardstick::Source::Computed,
+        };
+        yardstick::Options { source, ..yardstick::Options::default() }
+    }
+}
+
+/// The default of [`EvaluationOptions::figure_episodes`].
+fn figure_episodes() -> u64 {
     300_000
-}
-
-/// The constants of a world.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(rename_all = "kebab-case")]
-pub enum WorldConfig {
-    /// Constants of `lava-grid`.
-    LavaGrid(GridConfig),
-    /// Constants of `lava-point`.
-    LavaPoint(PointConfig),
-}
-
-impl WorldConfig {
-    /// The world's name.
-    pub fn name(&self) -> WorldName {
-        match self {
-            WorldConfig::LavaGrid(_) => WorldName::LavaGrid,
-            WorldConfig::LavaPoint(_) => WorldName::LavaPoint,
-        }
-    }
-
-    fn from_table(world: WorldName, table: Table) -> Result<Self, ConfigError> {
-        let refused = |error: toml::de::Error| ConfigError::World {
-            world,
-            message: one_line(error.message()),
-        };
-        let config = match world {
-            WorldName::LavaGrid => WorldConfig::LavaGrid(table.try_into().map_err(refused)?),
-            WorldName::LavaPoint => WorldConfig::LavaPoint(table.try_into().map_err(refused)?),
-        };
-        config.validate()?;
-        Ok(config)
-    }
-
-    /// Checks all numbers against their ranges.
-    ///
-    /// # Errors
-    /// Names the number that is out of range.
-    pub fn validate(&self) -> Result<(), ConfigError> {
-        match self {
-            WorldConfig::LavaGrid(config) => config.validate(),
-            WorldConfig::LavaPoint(config) => config.validate(),
-        }
-        .map_err(|error| ConfigError::World { world: self.name(), message: error.to_string() })
-    }
 }
 
 /// What one world is played with.
 #[derive(Debug, Clone, PartialEq)]
 pub struct WorldSettings {
     /// Its constants.
-    pub constants: WorldConfig,
+    pub constants: WorldConstants,
     /// Its training options: `[train]` with the world's own `[env.WORLD.train]` over it.
     pub train: TrainOptions,
 }
 
-/// The resolved configuration of a sweep.
+/// The options of runs.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Config {
-    /// Which runs.
-    pub experiment: Experiment,
+pub struct Settings {
     /// Discount factor gamma of the return.
     pub gamma: f64,
     /// Device of the networks.
@@ -289,285 +235,280 @@ pub struct Config {
     pub evaluation: EvaluationOptions,
     /// Settings of all worlds, selected or not.
     pub worlds: BTreeMap<WorldName, WorldSettings>,
+    /// Own options of all methods, selected or not.
+    pub methods: BTreeMap<MethodName, Table>,
+}
+
+/// A part of the experiment with options of its own.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Variant {
+    /// Its name.
+    pub name: VariantName,
+    /// Its worlds.
+    pub envs: Vec<WorldName>,
+    /// Its methods.
+    pub methods: Vec<MethodName>,
+    /// Its budgets.
+    pub etas: Vec<Eta>,
+    /// Its options.
+    pub settings: Settings,
+}
+
+/// What a configuration begins with, over the default.
+#[derive(Debug, Clone, Copy)]
+pub enum Source<'a> {
+    /// Nothing.
+    Default,
+    /// `configs/quick.toml`, which is embedded in the program.
+    Quick,
+    /// A file.
+    File(&'a Path),
+}
+
+impl<'a> Source<'a> {
+    /// The file, if there is one.
+    pub fn of(file: Option<&'a Path>) -> Self {
+        file.map_or(Source::Default, Source::File)
+    }
+}
+
+/// The small benchmark that runs in minutes.
+const QUICK: &str = include_str!("../../configs/quick.toml");
+
+/// The resolved configuration of a sweep.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Config {
+    /// Which runs.
+    pub experiment: Experiment,
+    /// Options without any variant's.
+    pub base: Settings,
+    /// The variants; where there are any, each run belongs to one.
+    pub variants: Vec<Variant>,
 }
 
 impl Config {
-    /// Resolves the default, then `file`, then `settings` in their order.
+    /// Resolves the default, then a file after the files that it extends, then each variant, then
+    /// `settings` in their order.
     ///
     /// # Errors
     /// On a file that cannot be read, an unknown key, a wrong type, a value out of range and values
-    /// that do not go together.
-    pub fn resolve(file: Option<&Path>, settings: &[Setting]) -> Result<Config, ConfigError> {
-        let default = Layer::default_layer();
-        let schema = default.table.clone();
-        let mut stack = vec![default];
-        if let Some(path) = file {
-            stack.push(Layer::read(path)?);
+    /// that are impossible together.
+    pub fn resolve(
+        catalogue: &Catalogue,
+        source: Source<'_>,
+        settings: &[Setting],
+    ) -> Result<Config, ConfigError> {
+        let schema = catalogue.schema();
+        let mut files = vec![Layer::default_of(catalogue)];
+        match source {
+            Source::Default => {}
+            Source::Quick => files.push(layers::parse("configs/quick.toml", QUICK)?),
+            Source::File(path) => files.extend(layers::read_files(path)?),
         }
-        for setting in settings.iter().filter(|setting| !setting.is_shorthand()) {
-            stack.push(setting.layer());
-        }
-        for layer in &stack {
-            layer.check(&schema)?;
-        }
+        // At first without `env.KEY`, which needs to know the selected worlds.
+        let plain = settings.iter().filter_map(|setting| setting.plain(schema));
+        let stack: Vec<Layer> = files.iter().cloned().chain(plain).collect();
+        stack.iter().try_for_each(|layer| layer.check(schema))?;
         let experiment: Experiment = section(&layers::merged(&stack), "experiment")?;
+        let drafts = variants::drafts(&stack, &experiment, settings, schema)?;
 
-        // Once more in the order given, now that it is known which worlds `env.KEY` means.
-        stack.truncate(1 + usize::from(file.is_some()));
+        let mut selected: Vec<WorldName> = drafts.iter().flat_map(|of| of.envs.clone()).collect();
+        if drafts.is_empty() {
+            selected.clone_from(&experiment.envs);
+        }
+        selected.sort();
+        selected.dedup();
+        let mut command = Vec::new();
         for setting in settings {
-            if setting.is_shorthand() {
-                stack.push(setting.expanded(&experiment.envs, &schema)?);
-            } else {
-                stack.push(setting.layer());
+            let layer = setting.layer(&selected, schema)?;
+            layer.check(schema)?;
+            command.push(layer);
+        }
+
+        let base = files.iter().chain(&command).cloned().collect::<Vec<_>>();
+        let base = Settings::of(catalogue, &base)?;
+        if drafts.is_empty() {
+            base.check(catalogue, &experiment.envs, &experiment.methods, None)?;
+        }
+        let mut variants = Vec::new();
+        for draft in drafts {
+            let mut stack = files.clone();
+            for setting in &draft.set {
+                let layer = setting.layer(&draft.envs, schema)?;
+                layer.check(schema)?;
+                stack.push(layer);
             }
+            stack.extend(command.iter().cloned());
+            let variants::Draft { name, envs, methods, etas, .. } = draft;
+            let settings = Settings::of(catalogue, &stack)?;
+            settings.check(catalogue, &envs, &methods, Some(&name))?;
+            variants.push(Variant { name, envs, methods, etas, settings });
         }
-        for layer in &stack {
-            layer.check(&schema)?;
+        Ok(Config { experiment, base, variants })
+    }
+
+    /// The settings of a world without any variant's.
+    ///
+    /// # Panics
+    /// If the catalogue has no such world.
+    pub fn world(&self, world: impl AsRef<str>) -> &WorldSettings {
+        &self.base.worlds[world.as_ref()]
+    }
+
+    /// The configuration of one run.
+    ///
+    /// # Panics
+    /// If the configuration has no such variant, or the catalogue no such world or method.
+    pub fn run(&self, id: &RunId) -> RunConfig {
+        let settings = match &id.variant {
+            None => &self.base,
+            Some(name) => {
+                let variant = self.variants.iter().find(|variant| variant.name == *name);
+                &variant.expect("the configuration has the variant").settings
+            }
+        };
+        let world = &settings.worlds[&id.world];
+        RunConfig {
+            method: id.method.clone(),
+            variant: id.variant.clone(),
+            eta: id.eta,
+            seed: id.seed,
+            gamma: settings.gamma,
+            device: settings.device,
+            env: world.constants.clone(),
+            train: world.train.clone(),
+            options: settings.methods[&id.method].clone(),
+            checkpoint: settings.checkpoint.clone(),
+            evaluation: settings.evaluation.clone(),
         }
-        let merged = layers::merged(&stack);
+    }
+
+    /// The configuration of the selected worlds and methods as a file that resolves to the same. Axes
+    /// are written as the variants that they make.
+    pub fn to_toml(&self) -> String {
+        let Experiment { envs, methods, .. } = &self.experiment;
+        let mut worlds: Vec<&WorldName> = envs.iter().collect();
+        let mut all_methods: Vec<&MethodName> = methods.iter().collect();
+        for variant in &self.variants {
+            worlds.extend(&variant.envs);
+            all_methods.extend(&variant.methods);
+        }
+        let base = self.base.table(&worlds, &all_methods);
+        let variants: Vec<Value> = self.variants.iter().map(|of| of.table(&base).into()).collect();
+        let mut experiment = as_table(&self.experiment);
+        if !variants.is_empty() {
+            experiment.insert("variant".to_owned(), variants.into());
+        }
+        let mut file = Table::new();
+        file.insert("experiment".to_owned(), experiment.into());
+        keys::merge(&mut file, &base);
+        printed(&file)
+    }
+}
+
+impl Settings {
+    /// The settings of all worlds and methods of the catalogue.
+    fn of(catalogue: &Catalogue, stack: &[Layer]) -> Result<Settings, ConfigError> {
+        let merged = layers::merged(stack);
         let mut worlds = BTreeMap::new();
-        for world in WorldName::ALL {
-            let train: TrainOptions = typed("train", layers::merged_train(&stack, world))?;
-            let constants = WorldConfig::from_table(world, layers::constants(&merged, world))?;
-            if experiment.envs.contains(&world) {
-                check_together(&train, world)?;
-            }
+        for WorldInfo { name, .. } in &catalogue.worlds {
+            let train: TrainOptions = typed("train", layers::merged_train(stack, name))?;
+            let world: WorldName = name.parse().map_err(|error| not_a_name(&error))?;
+            let table = layers::constants(&merged, name);
+            let constants = WorldConstants { world: world.clone(), table }.checked(catalogue)?;
             worlds.insert(world, WorldSettings { constants, train });
         }
-        Ok(Config {
-            experiment,
+        let mut methods = BTreeMap::new();
+        for MethodInfo { name, .. } in &catalogue.methods {
+            let method: MethodName = name.parse().map_err(|error| not_a_name(&error))?;
+            let options = keys::at(&merged, &format!("method.{name}"));
+            let options = options.and_then(Value::as_table).cloned().unwrap_or_default();
+            methods.insert(method, options);
+        }
+        Ok(Settings {
             gamma: section(&merged, "gamma")?,
             device: section(&merged, "device")?,
             checkpoint: section(&merged, "checkpoint")?,
             evaluation: section(&merged, "evaluation")?,
             worlds,
+            methods,
         })
     }
 
-    /// The settings of a world.
-    pub fn world(&self, world: WorldName) -> &WorldSettings {
-        &self.worlds[&world]
-    }
-
-    /// The configuration of one run.
-    pub fn run(&self, id: RunId) -> RunConfig {
-        let settings = self.world(id.env);
-        RunConfig {
-            eta: id.eta,
-            seed: id.seed,
-            gamma: self.gamma,
-            device: self.device,
-            env: settings.constants.clone(),
-            train: settings.train.clone(),
-            checkpoint: self.checkpoint.clone(),
-            evaluation: self.evaluation.clone(),
-        }
-    }
-
-    /// The selected worlds' configuration as a file that resolves to the same.
-    pub fn to_toml(&self) -> String {
-        #[derive(Serialize)]
-        struct File<'a> {
-            gamma: f64,
-            device: Device,
-            experiment: &'a Experiment,
-            checkpoint: &'a CheckpointOptions,
-            evaluation: &'a EvaluationOptions,
-            env: BTreeMap<WorldName, World<'a>>,
-        }
-        #[derive(Serialize)]
-        #[serde(untagged)]
-        enum World<'a> {
-            Grid(Section<'a, GridConfig>),
-            Point(Section<'a, PointConfig>),
-        }
-        #[derive(Serialize)]
-        struct Section<'a, C> {
-            #[serde(flatten)]
-            constants: &'a C,
-            train: &'a TrainOptions,
-        }
-        let env = self.worlds.iter().filter(|(name, _)| self.experiment.envs.contains(name)).map(
-            |(&name, WorldSettings { constants, train })| {
-                let world = match constants {
-                    WorldConfig::LavaGrid(constants) => World::Grid(Section { constants, train }),
-                    WorldConfig::LavaPoint(constants) => World::Point(Section { constants, train }),
-                };
-                (name, world)
-            },
-        );
-        let file = File {
-            gamma: self.gamma,
-            device: self.device,
-            experiment: &self.experiment,
-            checkpoint: &self.checkpoint,
-            evaluation: &self.evaluation,
-            env: env.collect(),
-        };
-        printed(&file)
-    }
-}
-
-/// The resolved configuration of one run.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct RunConfig {
-    /// Budget eta.
-    pub eta: Eta,
-    /// Seed of all random streams of training.
-    pub seed: u64,
-    /// Discount factor gamma of the return.
-    pub gamma: f64,
-    /// Device of the networks.
-    pub device: Device,
-    /// The world.
-    pub env: WorldConfig,
-    /// Training options.
-    pub train: TrainOptions,
-    /// When the unfinished run is saved.
-    pub checkpoint: CheckpointOptions,
-    /// Evaluation protocol.
-    pub evaluation: EvaluationOptions,
-}
-
-impl RunConfig {
-    /// `ENV/eta-E/seed-N`.
-    pub fn id(&self) -> RunId {
-        RunId { env: self.env.name(), eta: self.eta, seed: self.seed }
-    }
-
-    /// The text of the run's `config.toml`.
-    pub fn to_toml(&self) -> String {
-        #[derive(Serialize)]
-        struct File<'a> {
-            schema: u32,
-            #[serde(flatten)]
-            run: &'a RunConfig,
-        }
-        let file = File { schema: SCHEMA, run: self };
-        format!("# The resolved configuration of the run {}.\n{}", self.id(), printed(&file))
-    }
-
-    /// Reads a run's `config.toml` with the same checks as any configuration.
-    ///
-    /// # Errors
-    /// If the file cannot be read, is of another schema version or is not such a configuration.
-    pub fn load(path: &Path) -> Result<RunConfig, ConfigError> {
-        let Layer { origin, mut table } = Layer::read(path)?;
-        match table.remove("schema") {
-            Some(Value::Integer(version)) if version == i64::from(SCHEMA) => {}
-            other => {
-                let found = other.map_or("none".to_owned(), |version| version.to_string());
-                return Err(ConfigError::Schema { path: path.to_owned(), found });
+    /// Refuses options of these worlds and methods that are impossible together.
+    fn check(
+        &self,
+        catalogue: &Catalogue,
+        envs: &[WorldName],
+        methods: &[MethodName],
+        variant: Option<&VariantName>,
+    ) -> Result<(), ConfigError> {
+        for name in envs {
+            let world = catalogue.world(name)?;
+            let whose = match variant {
+                None => name.to_string(),
+                Some(variant) => format!("{name}, variant {variant}"),
+            };
+            for method in methods {
+                catalogue.method(method)?;
+                let method = (method, &self.methods[method]);
+                conflicts::check(catalogue, world, method, &self.worlds[name].train, &whose)?;
             }
         }
-        rules::check_all(&table, &origin)?;
-        let config: RunConfig = typed(&origin, table)?;
-        config.env.validate()?;
-        check_together(&config.train, config.env.name())?;
-        Ok(config)
+        Ok(())
     }
 
-    /// The dotted keys in which two configurations differ, with both values.
-    pub fn differences(&self, other: &RunConfig) -> Vec<Difference> {
-        let flat = |config: &RunConfig| {
-            let table = Table::try_from(config).expect("a configuration is representable as TOML");
-            layers::leaves(&table).into_iter().collect::<BTreeMap<_, _>>()
+    /// The options of these worlds and methods as a file has them.
+    fn table(&self, worlds: &[&WorldName], methods: &[&MethodName]) -> Table {
+        let mut table = Table::new();
+        table.insert("gamma".to_owned(), self.gamma.into());
+        table.insert("device".to_owned(), self.device.to_string().into());
+        table.insert("checkpoint".to_owned(), as_table(&self.checkpoint).into());
+        table.insert("evaluation".to_owned(), as_table(&self.evaluation).into());
+        let own =
+            self.methods.iter().filter(|(name, own)| methods.contains(name) && !own.is_empty());
+        let own = own.map(|(name, own)| (name.to_string(), Value::from(own.clone())));
+        let own: Table = own.collect();
+        if !own.is_empty() {
+            table.insert("method".to_owned(), own.into());
+        }
+        let world = |(name, WorldSettings { constants, train }): (&WorldName, &WorldSettings)| {
+            let mut section = constants.table.clone();
+            section.insert("train".to_owned(), as_table(train).into());
+            (name.to_string(), Value::from(section))
         };
-        let (ours, theirs) = (flat(self), flat(other));
-        let shown = |value: Option<&Value>| value.map_or("unset".to_owned(), rules::shown);
-        let mut keys: Vec<&String> = ours.keys().chain(theirs.keys()).collect();
-        keys.sort();
-        keys.dedup();
-        keys.into_iter()
-            .map(|key| (key, ours.get(key), theirs.get(key)))
-            .filter(|(_, ours, theirs)| ours != theirs)
-            .map(|(key, ours, theirs)| Difference {
-                key: key.clone(),
-                ours: shown(ours),
-                theirs: shown(theirs),
-            })
-            .collect()
+        let selected = self.worlds.iter().filter(|(name, _)| worlds.contains(name));
+        table.insert("env".to_owned(), selected.map(world).collect::<Table>().into());
+        table
     }
 }
 
-/// A key that two configurations do not agree on.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Difference {
-    /// The dotted key.
-    pub key: String,
-    /// Its value here.
-    pub ours: String,
-    /// Its value there.
-    pub theirs: String,
+impl Variant {
+    /// `[[experiment.variant]]` with what differs from the base.
+    fn table(&self, base: &Table) -> Table {
+        #[derive(Serialize)]
+        struct Section<'a> {
+            name: &'a VariantName,
+            envs: &'a [WorldName],
+            methods: &'a [MethodName],
+            etas: &'a [Eta],
+            set: Table,
+        }
+        let Variant { name, envs, methods, etas, settings } = self;
+        let own =
+            settings.table(&envs.iter().collect::<Vec<_>>(), &methods.iter().collect::<Vec<_>>());
+        let differs = |(key, value): &(String, Value)| keys::at(base, key) != Some(value);
+        let set = keys::leaves(&own).into_iter().filter(differs).collect();
+        as_table(&Section { name, envs, methods, etas, set })
+    }
 }
 
-/// Largest rollout in environment steps: about 2 GB of records.
-const LARGEST_ROLLOUT: usize = 10_000_000;
-/// Longest schedule.
-const MOST_UPDATES: u64 = 10_000_000;
-/// Most hidden units times samples: 8 GB of activations.
-const MOST_UNITS: usize = 1_000_000_000;
+fn as_table(part: &impl Serialize) -> Table {
+    Table::try_from(part).expect("a configuration is representable as TOML")
+}
 
-/// Refuses training options that are fine each and impossible together.
-fn check_together(train: &TrainOptions, world: WorldName) -> Result<(), ConfigError> {
-    let conflict = |message: String| Err(ConfigError::Conflict(format!("{message} ({world})")));
-    let rollout = train.parallel_episodes.saturating_mul(train.rollout_steps);
-    if rollout > LARGEST_ROLLOUT {
-        return conflict(format!(
-            "train.parallel_episodes * train.rollout_steps = {rollout} is too large; use at most \
-             {LARGEST_ROLLOUT}"
-        ));
-    }
-    let updates = train.steps / rollout as u64;
-    if updates > MOST_UPDATES {
-        return conflict(format!(
-            "train.steps = {} are {updates} updates of {rollout} steps each; use at most \
-             {MOST_UPDATES}",
-            train.steps
-        ));
-    }
-    if train.steps < rollout as u64 {
-        return conflict(format!(
-            "train.steps = {} is less than one rollout, train.parallel_episodes * \
-             train.rollout_steps = {rollout}; raise the one or lower the others",
-            train.steps
-        ));
-    }
-    for (player, options) in
-        [("protagonist", &train.protagonist), ("antagonist", &train.antagonist)]
-    {
-        let units = rollout.saturating_mul(options.hidden);
-        if units > MOST_UNITS {
-            return conflict(format!(
-                "train.{player}.hidden = {} times the steps of a rollout, {rollout}, is {units}; use \
-                 at most {MOST_UNITS}",
-                options.hidden
-            ));
-        }
-        if options.minibatch > rollout {
-            return conflict(format!(
-                "train.{player}.minibatch = {} is more than a rollout has, \
-                 train.parallel_episodes * train.rollout_steps = {rollout}; use at most that",
-                options.minibatch
-            ));
-        }
-    }
-    let phases = train.budget_wait + train.budget_rise + train.response;
-    if phases > 1.0 {
-        return conflict(format!(
-            "train.budget_wait + train.budget_rise + train.response = {phases} must be at most 1, the \
-             whole run"
-        ));
-    }
-    if train.credit == Credit::Executed && world != WorldName::LavaGrid {
-        return conflict(
-            "train.credit = \"executed\" is for lava-grid alone, where chance decides a move; set \
-             env.lava-grid.train.credit instead"
-                .into(),
-        );
-    }
-    Ok(())
+fn not_a_name(error: &super::names::NotAName) -> ConfigError {
+    ConfigError::Conflict(error.to_string())
 }
 
 /// A configuration as TOML: texts of several lines as they are, and each list on one line.

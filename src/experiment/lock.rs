@@ -5,7 +5,7 @@ use std::io;
 use std::path::Path;
 
 /// Held by the process that carries out a run. The system releases it when that process ends, however
-/// it ends, so no lock is ever left behind; the empty file `.lock` is.
+/// it ends, so no lock outlasts its process; the empty file `.lock` stays.
 #[derive(Debug)]
 pub struct RunLock {
     _file: File,

@@ -3,17 +3,18 @@
 //! Nothing starts before everything is checked: [`prepare`] looks at every run's folder first and
 //! refuses one that holds something else. [`sweep`] then carries out the runs that are not finished,
 //! each by a [`Launcher`]: a worker process of its own, this process, or a mock in tests. A run that
-//! fails is told and the others go on. Artefacts appear in one piece, `evaluation.json` last, so that
-//! a run cut short is recognised; it goes on from its last checkpoint.
+//! fails is told and the others continue. Artefacts appear in one piece, `evaluation.json` last, so that
+//! a run cut short is recognised; it continues from its last checkpoint.
 //!
 //! Several sweeps may share a folder, on one machine or many: whoever carries out a run holds its
 //! lock, and the others work on other runs until it is free.
 
 mod worker;
 
+use super::archive::RunFiles;
 use super::artefacts::{Evaluation, Manifest, SCHEMA};
 use super::checkpoint;
-use super::config::{Config, ConfigError, RunConfig};
+use super::config::{Catalogue, Config, ConfigError, RunConfig};
 use super::lock::RunLock;
 use super::names::RunId;
 use crate::files::{read_text, write_in_place};
@@ -114,7 +115,7 @@ pub enum Event {
         /// Its environment steps in all.
         steps: u64,
     },
-    /// A run goes on.
+    /// A run makes progress.
     Ticked {
         /// The run.
         run: RunId,
@@ -166,7 +167,8 @@ pub struct Outcome {
 
 /// The runs of a sweep that are still to do, all folders checked.
 #[derive(Debug)]
-pub struct Prepared {
+pub struct Prepared<'a> {
+    catalogue: &'a Catalogue,
     out: PathBuf,
     /// Runs to do, in order.
     pub todo: Vec<RunConfig>,
@@ -179,20 +181,25 @@ pub struct Prepared {
 ///
 /// # Errors
 /// See [`RunnerError`]; nothing has been overwritten then.
-pub fn prepare(config: &Config, runs: &[RunId], out: &Path) -> Result<Prepared, RunnerError> {
+pub fn prepare<'a>(
+    catalogue: &'a Catalogue,
+    config: &Config,
+    runs: &[RunId],
+    out: &Path,
+) -> Result<Prepared<'a>, RunnerError> {
     require_writable(out)?;
     let mut todo = Vec::new();
     let mut finished = Vec::new();
-    for &id in runs {
+    for id in runs {
         let run = config.run(id);
-        if is_finished(&run, &id.folder(out))? {
+        if is_finished(catalogue, &run, &id.folder(out))? {
             tidy(&id.folder(out));
-            finished.push(id);
+            finished.push(id.clone());
         } else {
             todo.push(run);
         }
     }
-    Ok(Prepared { out: out.to_owned(), todo, finished })
+    Ok(Prepared { catalogue, out: out.to_owned(), todo, finished })
 }
 
 /// How long to wait for a run that another process works on before looking again.
@@ -200,13 +207,13 @@ const PAUSE: Duration = Duration::from_millis(250);
 
 /// Carries out the runs, `jobs` at a time, and tells `watch` what happens.
 pub fn sweep(
-    prepared: &Prepared,
+    prepared: &Prepared<'_>,
     jobs: NonZeroUsize,
     launcher: &dyn Launcher,
     stop: &Stop,
     watch: &mut dyn FnMut(&Event),
 ) -> Outcome {
-    let Prepared { out, todo, .. } = prepared;
+    let Prepared { todo, .. } = prepared;
     let queue: Mutex<VecDeque<&RunConfig>> = Mutex::new(todo.iter().collect());
     let (events, incoming) = mpsc::channel();
     let mut outcome = Outcome::default();
@@ -220,7 +227,7 @@ pub fn sweep(
                     let Some(run) = queue().pop_front() else { break };
                     // The receiver lives until all senders are gone.
                     let mut send = |event| events.send(event).expect("the sweep listens");
-                    match carry_out(run, out, launcher, stop, &mut send) {
+                    match carry_out(prepared, run, launcher, stop, &mut send) {
                         Some(end) => send(end),
                         None => {
                             queue().push_back(run);
@@ -246,26 +253,26 @@ pub fn sweep(
 
 /// One run to its end; `None` if it has to be tried again, because another process works on it.
 fn carry_out(
+    prepared: &Prepared<'_>,
     run: &RunConfig,
-    out: &Path,
     launcher: &dyn Launcher,
     stop: &Stop,
     send: &mut dyn FnMut(Event),
 ) -> Option<Event> {
     let id = run.id();
-    let folder = id.folder(out);
+    let folder = id.folder(&prepared.out);
     let start = Instant::now();
     let mut steps = 0;
-    let result = match begin(run, &folder) {
+    let result = match begin(prepared.catalogue, run, &folder) {
         Ok(Begun::Free) => {
-            send(Event::Started { run: id, steps: run.train.steps });
+            send(Event::Started { run: id.clone(), steps: run.train.steps });
             launcher.launch(run, &folder, stop, &mut |report| {
                 send(match report {
                     Report::Tick(tick) => {
                         steps = tick.steps;
-                        Event::Ticked { run: id, tick }
+                        Event::Ticked { run: id.clone(), tick }
                     }
-                    Report::Note(note) => Event::Noted { run: id, note },
+                    Report::Note(note) => Event::Noted { run: id.clone(), note },
                 });
             })
         }
@@ -303,25 +310,31 @@ fn require_writable(out: &Path) -> Result<(), RunnerError> {
         .map_err(|source| RunnerError::Output { folder: out.to_owned(), source })
 }
 
-/// Whether the folder holds this run, finished.
-fn is_finished(run: &RunConfig, folder: &Path) -> Result<bool, RunnerError> {
+/// Whether this run is finished, in its folder or in the archive of its results folder.
+fn is_finished(catalogue: &Catalogue, run: &RunConfig, folder: &Path) -> Result<bool, RunnerError> {
     let foreign = |reason: String| RunnerError::Foreign { folder: folder.to_owned(), reason };
+    let unreadable = |error| foreign(format!("cannot be read ({error})"));
+    let files = RunFiles::at(folder).map_err(unreadable)?;
+    let packed = files.filter(RunFiles::is_packed);
     let is_empty = match fs::read_dir(folder) {
         // Hidden files are a lock, and what is left of a file that was being written.
         Ok(entries) => entries
             .map_while(Result::ok)
             .all(|entry| entry.file_name().as_encoded_bytes().starts_with(b".")),
         Err(error) if error.kind() == io::ErrorKind::NotFound => true,
-        Err(error) => return Err(foreign(format!("cannot be read ({error})"))),
+        Err(error) => return Err(unreadable(error)),
     };
-    if is_empty {
-        return Ok(false);
-    }
-    let path = folder.join("config.toml");
-    if !path.exists() {
-        return Err(foreign("holds files but no config.toml".into()));
-    }
-    let there = match RunConfig::load(&path) {
+    let path = packed.as_ref().map_or(folder.join("config.toml"), |of| of.place("config.toml"));
+    let loaded = match packed {
+        Some(packed) => match packed.text("config.toml").map_err(unreadable)? {
+            Some(text) => RunConfig::parse(&path, &text, catalogue),
+            None => return Err(foreign(format!("is packed without {}", path.display()))),
+        },
+        None if is_empty => return Ok(false),
+        None if !path.exists() => return Err(foreign("holds files but no config.toml".into())),
+        None => RunConfig::load(&path, catalogue),
+    };
+    let mut there = match loaded {
         Ok(there) => there,
         Err(error @ ConfigError::Schema { .. }) => return Err(RunnerError::Schema(error)),
         Err(error) => {
@@ -330,6 +343,9 @@ fn is_finished(run: &RunConfig, folder: &Path) -> Result<bool, RunnerError> {
             )));
         }
     };
+    // A run of a former version does not say its variant; its folder does.
+    let variant = there.variant.take().or_else(|| run.variant.clone());
+    let there = RunConfig { variant, ..there };
     let differences = run.differences(&there);
     if !differences.is_empty() {
         let mut told: Vec<String> = differences
@@ -346,17 +362,23 @@ fn is_finished(run: &RunConfig, folder: &Path) -> Result<bool, RunnerError> {
     read_evaluation(folder).map(|evaluation| evaluation.is_some())
 }
 
-/// The evaluation of a run's folder; `None` if there is none yet.
+/// The evaluation of a run, from its folder or from the archive of its results folder; `None` if there is
+/// none yet.
 ///
 /// # Errors
 /// If it is damaged or of another schema version.
 pub fn read_evaluation(folder: &Path) -> Result<Option<Evaluation>, RunnerError> {
     let foreign = |reason: String| RunnerError::Foreign { folder: folder.to_owned(), reason };
-    let text = match read_text(&folder.join("evaluation.json")) {
-        Ok(text) => text,
-        Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(None),
-        Err(error) => return Err(foreign(format!("has an unreadable evaluation.json ({error})"))),
+    let path = folder.join("evaluation.json");
+    let text = match RunFiles::at(folder) {
+        Ok(Some(files)) => files.text("evaluation.json"),
+        // A folder of another name has no archive above it.
+        Ok(None) => path.exists().then(|| read_text(&path)).transpose(),
+        Err(error) => Err(error),
     };
+    let text =
+        text.map_err(|error| foreign(format!("has an unreadable evaluation.json ({error})")));
+    let Some(text) = text? else { return Ok(None) };
     let damaged = |error| foreign(format!("has a damaged evaluation.json ({error})"));
     let value: serde_json::Value = serde_json::from_str(&text).map_err(damaged)?;
     if value["schema"] != SCHEMA {
@@ -379,12 +401,12 @@ enum Begun {
 }
 
 /// Makes the folder with its `config.toml`, if nobody else works there.
-fn begin(run: &RunConfig, folder: &Path) -> Result<Begun, String> {
+fn begin(catalogue: &Catalogue, run: &RunConfig, folder: &Path) -> Result<Begun, String> {
     let refused = |error| format!("cannot write to {}: {error}", folder.display());
     fs::create_dir_all(folder).map_err(refused)?;
     let Some(_lock) = RunLock::take(folder).map_err(refused)? else { return Ok(Begun::Busy) };
     // Looked at again: another sweep may have been here since `prepare`.
-    if is_finished(run, folder).map_err(|error| error.to_string())? {
+    if is_finished(catalogue, run, folder).map_err(|error| error.to_string())? {
         return Ok(Begun::Finished);
     }
     write_in_place(&folder.join("config.toml"), run.to_toml().as_bytes()).map_err(refused)?;
@@ -417,7 +439,7 @@ fn record_failure(
     let path = folder.join("manifest.json");
     let written = read_text(&path).ok().and_then(|text| serde_json::from_str(&text).ok());
     let mut manifest =
-        written.unwrap_or_else(|| Manifest::of(run.id(), &run.device.to_string(), steps, seconds));
+        written.unwrap_or_else(|| Manifest::of(&run.id(), &run.device.to_string(), steps, seconds));
     manifest.failure.get_or_insert_with(|| reason.to_owned());
     let mut text = serde_json::to_string_pretty(&manifest)?;
     text.push('\n');

@@ -1,11 +1,11 @@
-//! A sweep as a Slurm job array: one task per run, then a job that makes the tables.
+//! A sweep as a Slurm job array: one task per run, then a job that writes the tables.
 //!
 //! | file in `OUT/slurm/` | what |
 //! |---|---|
 //! | `config.toml` | the resolved configuration: later changes of the user's file do not matter |
-//! | `runs.txt` | the runs, a line each |
+//! | `runs.txt` | the runs, one per line |
 //! | `array.sh` | the task: carries out one line of `runs.txt` |
-//! | `table.sh` | the job behind them |
+//! | `table.sh` | the job that runs after them |
 //! | `submit.sh` | submits both |
 //!
 //! A minute before its time limit a task gets SIGTERM; it writes a checkpoint, exits with
@@ -23,9 +23,9 @@ use std::path::{Path, PathBuf};
 /// Tasks of one array: Slurm's default MaxArraySize admits indices up to 1000.
 const LARGEST_ARRAY: usize = 1000;
 
-/// What the user asks of Slurm.
+/// The user's options for Slurm.
 #[derive(Debug, Clone, Default)]
-pub struct Wishes {
+pub struct SlurmOptions {
     /// Time limit of a task.
     pub time: Option<String>,
     /// Partition.
@@ -46,7 +46,7 @@ pub fn write(
     runs: &[RunId],
     out: &Path,
     program: &Path,
-    wishes: &Wishes,
+    options: &SlurmOptions,
 ) -> io::Result<PathBuf> {
     let out = std::path::absolute(out)?;
     let folder = out.join("slurm");
@@ -95,32 +95,38 @@ exit "$code"
     write_in_place(&runs_file, list.as_bytes())?;
     write_in_place(&array, task.as_bytes())?;
     write_in_place(&table, after.as_bytes())?;
-    let text = submission(runs.len(), &folder, [&quoted(&array), &quoted(&table)], wishes);
+    let text = submission(runs.len(), &folder, [&quoted(&array), &quoted(&table)], options);
     write_in_place(&submit, text.as_bytes())?;
     Ok(submit)
 }
 
 /// The text of `submit.sh`.
-fn submission(runs: usize, folder: &Path, [array, table]: [&str; 2], wishes: &Wishes) -> String {
-    let options = |time: bool| {
-        let time = wishes.time.iter().filter(|_| time).map(|time| format!("--time={time}"));
-        let partition = wishes.partition.iter().map(|partition| format!("--partition={partition}"));
-        let all = time.chain(partition).chain(wishes.extra.iter().cloned());
+fn submission(
+    runs: usize,
+    folder: &Path,
+    [array, table]: [&str; 2],
+    options: &SlurmOptions,
+) -> String {
+    let flags = |time: bool| {
+        let time = options.time.iter().filter(|_| time).map(|time| format!("--time={time}"));
+        let partition =
+            options.partition.iter().map(|partition| format!("--partition={partition}"));
+        let all = time.chain(partition).chain(options.extra.iter().cloned());
         all.map(|option| format!(" {}", quoted(&option))).collect::<String>()
     };
-    let log = |name: &str| {
-        quoted(&format!("--output={}", folder.join(name).to_string_lossy().replace('%', "%%")))
-    };
-    let limit = wishes.array_limit.map_or(String::new(), |limit| format!("%{limit}"));
+    // sbatch replaces patterns such as %A, so a `%` of the folder is doubled.
+    let folder = folder.to_string_lossy().replace('%', "%%");
+    let log = |name: &str| quoted(&format!("--output={folder}/{name}"));
+    let limit = options.array_limit.map_or(String::new(), |limit| format!("%{limit}"));
     let mut text = "#!/bin/sh\n# Submits the sweep.\nset -eu\nafter=\n".to_owned();
     for first in (0..runs).step_by(LARGEST_ARRAY) {
         let last = (runs - first).min(LARGEST_ARRAY) - 1;
-        let logs = log("PLACE").replace("PLACE", "%A_%a.log");
+        let logs = log("%A_%a.log");
         let _ = writeln!(
             text,
             "id=$(sbatch --parsable --array=0-{last}{limit} --export=ALL,FIRST={first} \
              {logs}{} {array})\nafter=$after:${{id%%;*}}",
-            options(true)
+            flags(true)
         );
     }
     let logs = log("table.log");
@@ -129,14 +135,15 @@ fn submission(runs: usize, folder: &Path, [array, table]: [&str; 2], wishes: &Wi
         text,
         "table=$(sbatch --parsable --dependency=\"afterany$after\" {logs}{} {table})\n\
          echo \"submitted as jobs ${{after#:}}, the table as job ${{table%%;*}}\"",
-        options(false)
+        flags(false)
     );
     text
 }
 
-/// A word of the shell.
+/// A text as one word of the shell.
 fn quoted(word: &str) -> String {
-    format!("'{}'", word.replace('\'', r"'\''"))
+    let quoter = shlex::Quoter::new().allow_nul(true);
+    quoter.quote(word).expect("only NUL can be refused").into_owned()
 }
 
 #[cfg(test)]
@@ -154,9 +161,9 @@ mod tests {
 
     #[test]
     fn a_long_sweep_becomes_several_arrays_that_cover_it() {
-        let wishes = Wishes { array_limit: NonZeroUsize::new(8), ..Wishes::default() };
+        let options = SlurmOptions { array_limit: NonZeroUsize::new(8), ..SlurmOptions::default() };
         let text =
-            submission(2_001, Path::new("/out/slurm"), ["'array.sh'", "'table.sh'"], &wishes);
+            submission(2_001, Path::new("/out/slurm"), ["'array.sh'", "'table.sh'"], &options);
         for part in [
             "--array=0-999%8 --export=ALL,FIRST=0 ",
             "--array=0-999%8 --export=ALL,FIRST=1000 ",

@@ -1,8 +1,8 @@
-//! Stopping on request, with nothing lost.
+//! Stopping on request without losing work.
 //!
-//! A signal asks a run to write a checkpoint after its current update and to end. While there is
-//! nothing to write, as in the evaluation, which starts anew from the trained players, the process ends
-//! at once. Either way it exits with [`RESUME`] after SIGTERM, which schedulers send before a time
+//! A signal makes a run write a checkpoint after its current update and end. While there is
+//! nothing to write, as in the evaluation, which starts again from the trained players, the process
+//! ends at once. Either way it exits with [`RESUME`] after SIGTERM, which schedulers send before a time
 //! limit, and with 130 after SIGINT. A second SIGINT ends the process at once; a second SIGTERM does
 //! not, because schedulers repeat it.
 
@@ -53,7 +53,7 @@ impl Stop {
         }
     }
 
-    /// The number of the signal that asked to stop.
+    /// The number of the signal that requested the stop.
     pub fn signal(&self) -> Option<i32> {
         Some(self.signal.load(Ordering::SeqCst) as i32).filter(|&signal| signal != 0)
     }

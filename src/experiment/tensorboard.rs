@@ -5,19 +5,19 @@
 //! buffer `Event { double wall_time = 1; int64 step = 2; string file_version = 3; Summary summary = 5 }`
 //! with `Summary { repeated Value value = 1 }`, `Value { string tag = 1; float simple_value = 2 }`.
 
-use std::fs::File;
+use super::growing_file::{Extent, GrowingFile};
 use std::io::{self, Write};
 use std::path::Path;
 
 /// Name of the file in a run's folder; TensorBoard looks for `tfevents` in it.
 pub const FILE: &str = "events.out.tfevents.cvar-game";
 
-/// What TensorBoard wants to be told first.
+/// What TensorBoard expects in the first event.
 const VERSION: &[u8] = b"brain.Event:2";
 
 /// An event file that grows event by event, so that a run can be watched.
 #[derive(Debug)]
-pub struct EventFile(File);
+pub struct EventFile(GrowingFile);
 
 impl EventFile {
     /// Begins the file of a run's folder; `wall_time` is in seconds since 1970.
@@ -25,7 +25,7 @@ impl EventFile {
     /// # Errors
     /// If the file cannot be written.
     pub fn create(folder: &Path, wall_time: f64) -> io::Result<Self> {
-        let mut file = EventFile(File::create(folder.join(FILE))?);
+        let mut file = EventFile(GrowingFile::create(&folder.join(FILE))?);
         let mut event = Vec::new();
         double(&mut event, 1, wall_time);
         bytes(&mut event, 3, VERSION);
@@ -33,7 +33,23 @@ impl EventFile {
         Ok(file)
     }
 
-    /// Adds numbers by tag; those that are not finite are left out.
+    /// Continues the file of a run's folder after `extent`, which ends with a whole event.
+    ///
+    /// # Errors
+    /// If the file cannot be written or has changed.
+    pub fn resume(folder: &Path, extent: Extent) -> io::Result<Self> {
+        GrowingFile::resume(&folder.join(FILE), extent).map(EventFile)
+    }
+
+    /// What was written so far, which is on the disk then.
+    ///
+    /// # Errors
+    /// If it cannot be written to the disk.
+    pub fn extent(&self) -> io::Result<Extent> {
+        self.0.extent()
+    }
+
+    /// Adds numbers by tag; those that are not finite are omitted.
     ///
     /// # Errors
     /// If the file cannot be written.
@@ -53,7 +69,7 @@ impl EventFile {
         self.record(&event)
     }
 
-    /// One record in one write: a reader meets whole ones.
+    /// One record in one write: a reader sees only complete records.
     fn record(&mut self, event: &[u8]) -> io::Result<()> {
         let length = (event.len() as u64).to_le_bytes();
         let mut record = Vec::with_capacity(event.len() + 16);

@@ -85,7 +85,7 @@ impl Budget {
         Budget(eta.0)
     }
 
-    /// The remaining budget of a trajectory that goes on.
+    /// The remaining budget of a trajectory that continues.
     ///
     /// # Errors
     /// [`NotABudget`] if it is below 1 or not finite.
@@ -111,7 +111,7 @@ impl Budget {
             "likelihood ratio {likelihood_ratio} is not admissible within the budget {}",
             self.0
         );
-        // The ratio may exceed the budget by rounding alone.
+        // The ratio may exceed the budget only by rounding.
         Budget((self.0 / likelihood_ratio).clamp(1.0, LARGEST))
     }
 

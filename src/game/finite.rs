@@ -1,58 +1,58 @@
-//! The finite family (grid): `w = softmax(logits)`, `delta^0_i = w_i / sum_j p_j w_j`,
+//! The family of laws of finitely many outcomes: `w = softmax(logits)`, `delta^0_i = w_i / sum_j p_j w_j`,
 //! `M = max_i delta^0_i`, followed by identity mixing.
 
 use crate::game::budget::{Budget, Mixing};
 use crate::game::perturbation::{Family, Perturbation};
-use lava_envs::law::{FiniteLaw, MOVES, sample_index};
+use lava_envs::law::{FiniteLaw, sample_index};
 use rand::Rng;
 
-/// The finite family; its parameters are the logits.
+/// The finite family over `N` outcomes; its parameters are the logits, shape `[N]`.
 #[derive(Debug, Clone, Copy, Default)]
-pub struct FiniteFamily;
+pub struct FiniteFamily<const N: usize>;
 
 /// An admissible perturbation of a finite law.
 #[derive(Debug, Clone)]
-pub struct FinitePerturbation {
-    nominal: [f64; MOVES],
+pub struct FinitePerturbation<const N: usize> {
+    nominal: [f64; N],
     /// delta^0; 1 where the nominal probability is 0.
-    base: [f64; MOVES],
+    base: [f64; N],
     /// The outcome where delta^0 attains M.
     top: usize,
     mixing: Mixing,
     /// delta.
-    ratio: [f64; MOVES],
+    ratio: [f64; N],
     /// P delta.
-    perturbed: [f64; MOVES],
+    perturbed: [f64; N],
 }
 
-impl Family for FiniteFamily {
-    type Law = FiniteLaw;
-    type Perturbation = FinitePerturbation;
+impl<const N: usize> Family for FiniteFamily<N> {
+    type Law = FiniteLaw<N>;
+    type Perturbation = FinitePerturbation<N>;
 
     fn parameters(&self) -> usize {
-        MOVES
+        N
     }
 
     fn perturbation(
         &self,
         parameters: &[f64],
-        law: &FiniteLaw,
+        law: &FiniteLaw<N>,
         budget: Budget,
-    ) -> FinitePerturbation {
+    ) -> FinitePerturbation<N> {
         let nominal = law.probabilities;
         // The softmax's own normaliser cancels in delta^0. Outcomes that cannot happen have no say
         // in M: their ratio multiplies nothing.
         let mut top = usize::MAX;
-        for i in 0..MOVES {
+        for i in 0..N {
             if nominal[i] > 0.0 && (top == usize::MAX || parameters[i] > parameters[top]) {
                 top = i;
             }
         }
         let possible = |i: usize| nominal[i] > 0.0;
-        let weights: [f64; MOVES] = std::array::from_fn(|i| {
+        let weights: [f64; N] = std::array::from_fn(|i| {
             if possible(i) { (parameters[i] - parameters[top]).exp() } else { 0.0 }
         });
-        let sum: f64 = (0..MOVES).map(|i| nominal[i] * weights[i]).sum();
+        let sum: f64 = (0..N).map(|i| nominal[i] * weights[i]).sum();
         let base = std::array::from_fn(|i| if possible(i) { weights[i] / sum } else { 1.0 });
         let mixing = budget.mix(-sum.ln());
         let ratio = base.map(|base| mixing.likelihood_ratio(base));
@@ -61,9 +61,9 @@ impl Family for FiniteFamily {
     }
 }
 
-impl FinitePerturbation {
+impl<const N: usize> FinitePerturbation<N> {
     /// The perturbed probabilities P_t(o) delta_t(o).
-    pub fn probabilities(&self) -> &[f64; MOVES] {
+    pub fn probabilities(&self) -> &[f64; N] {
         &self.perturbed
     }
 
@@ -80,8 +80,8 @@ impl FinitePerturbation {
     }
 }
 
-impl Perturbation for FinitePerturbation {
-    type Law = FiniteLaw;
+impl<const N: usize> Perturbation for FinitePerturbation<N> {
+    type Law = FiniteLaw<N>;
 
     fn likelihood_ratio(&self, outcome: usize) -> f64 {
         self.ratio[outcome]
@@ -105,7 +105,7 @@ impl Perturbation for FinitePerturbation {
     fn entropy(&self, gradient: &mut [f64]) -> f64 {
         gradient.fill(0.0);
         let mut entropy = 0.0;
-        for i in 0..MOVES {
+        for i in 0..N {
             let q = self.perturbed[i];
             if q > 0.0 {
                 let log_q = q.ln();

@@ -36,7 +36,7 @@ pub struct GaussianFamily {
 /// An admissible perturbation of the standard normal law.
 #[derive(Debug, Clone)]
 pub struct GaussianPerturbation {
-    /// The bumps; those behind `count` have weight 0.
+    /// The bumps; those after the first `count` have weight 0.
     bumps: [Bump; MAX_BUMPS],
     weights: [f64; MAX_BUMPS],
     count: usize,

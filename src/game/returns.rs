@@ -26,11 +26,44 @@ pub struct Atom {
     pub mass: f64,
 }
 
+/// The return of an episode while it runs: `J = sum_t gamma^t r_t`, step by step.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct ReturnSoFar {
+    /// The sum so far, discounted.
+    pub value: f64,
+    /// The sum so far, undiscounted.
+    pub undiscounted: f64,
+    /// gamma^t.
+    discount: f64,
+    /// Steps t.
+    pub steps: u32,
+}
+
+impl ReturnSoFar {
+    /// An episode that has not begun.
+    pub const START: ReturnSoFar =
+        ReturnSoFar { value: 0.0, undiscounted: 0.0, discount: 1.0, steps: 0 };
+
+    /// Adds the reward of the next step.
+    pub fn add(&mut self, reward: f64, gamma: f64) {
+        self.value += self.discount * reward;
+        self.undiscounted += reward;
+        self.discount *= gamma;
+        self.steps += 1;
+    }
+
+    /// The episode as an atom of the law of the return, of mass 1, once it has ended so.
+    pub fn ended(self, end: End) -> Atom {
+        let ReturnSoFar { value, undiscounted, steps, .. } = self;
+        Atom { value, undiscounted, steps, end, mass: 1.0 }
+    }
+}
+
 /// The law of the return J: atoms in ascending order of value, whose masses sum to 1.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct ReturnLaw {
     atoms: Vec<Atom>,
-    /// Number of recorded episodes behind the law; `None` for an exact one.
+    /// Number of recorded episodes in the law; `None` for an exact one.
     episodes: Option<u64>,
 }
 
@@ -57,7 +90,7 @@ impl ReturnLaw {
         &self.atoms
     }
 
-    /// Number of recorded episodes behind the law; `None` for an exact one.
+    /// Number of recorded episodes in the law; `None` for an exact one.
     pub fn episodes(&self) -> Option<u64> {
         self.episodes
     }
@@ -143,7 +176,7 @@ impl ReturnLaw {
     }
 }
 
-/// Sorts by value (then steps and end) and joins atoms that differ in mass alone.
+/// Sorts by value (then steps and end) and joins atoms that differ only in mass.
 fn merged(mut atoms: Vec<Atom>) -> Vec<Atom> {
     atoms.sort_by(|a, b| {
         a.value.total_cmp(&b.value).then(a.steps.cmp(&b.steps)).then(a.end.cmp(&b.end))

@@ -1,4 +1,4 @@
-//! Adam (Kingma & Ba 2015) over one flat vector, with all of its state in the open.
+//! Adam (Kingma & Ba 2015) over one flat vector, with all of its state accessible.
 
 use serde::{Deserialize, Serialize};
 

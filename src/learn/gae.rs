@@ -1,7 +1,7 @@
 //! Generalised advantage estimation (Schulman et al. 2016).
 //!
 //! `A_t = sum_{k>=0} (gamma lambda)^k d_{t+k}`, `d_t = r_t + gamma V(s_{t+1}) - V(s_t)`, within one
-//! episode. The end of an episode is a true end, the time limit included: V is 0 behind it. Where
+//! episode. The end of an episode is a true end, the time limit included: V is 0 after it. Where
 //! the rollout ends within an episode, V(s_T) is bootstrapped from the critic.
 
 /// Writes the advantages. Time-major arrays: `rewards` and `ended` have shape `[steps, slots]`,

@@ -1,29 +1,29 @@
 //! Heads: what the outputs of an actor mean.
 //!
-//! PPO needs of a player's law nothing but draws, log-probabilities and the gradients of
-//! log-probability and entropy by the actor's outputs; [`Head`] is just that. The protagonist's
+//! PPO needs only draws, log-probabilities and the gradients of log-probability and entropy by
+//! the actor's outputs of a player's law; [`Head`] is exactly that. The protagonist's
 //! heads are the categorical and the Gaussian policy. The antagonist's policy IS the perturbed law
 //! of chance and its action IS the realised outcome, so its head wraps a family of perturbations.
 
-use cvar_game::game::budget::Budget;
-use cvar_game::game::bump;
-use cvar_game::game::gaussian::MAX_BUMPS;
-use cvar_game::game::perturbation::{Family, Perturbation};
-use lava_envs::law::{Law, MOVES, sample_index};
-use lava_envs::{Force, Move};
+use super::options::TrainOptions;
+use super::policy::Mode;
+use crate::game::budget::Budget;
+use crate::game::perturbation::{Family, Perturbation};
+use lava_envs::Force;
+use lava_envs::action::{Action, Discrete, Finite, Plane};
+use lava_envs::law::{Law, sample_index};
 use nalgebra::Vector2;
 use rand::{Rng, RngExt};
 use rand_distr::StandardNormal;
-
-/// The most parameters that a head takes: those of a sum of bumps with their weights.
-pub const MAX_PARAMETERS: usize = (bump::PARAMETERS + 1) * MAX_BUMPS;
+use smallvec::SmallVec;
+use std::marker::PhantomData;
 
 /// The law of a player's choice, given the outputs of its actor.
 ///
 /// The head's parameters are the actor's outputs followed by the head's constants, parameters that
-/// no observation moves.
+/// do not depend on the observation.
 pub trait Head: Clone + std::fmt::Debug {
-    /// What the law depends on beside its parameters.
+    /// What the law depends on besides its parameters.
     type Given: Copy + std::fmt::Debug;
     /// What is chosen.
     type Choice: Copy + std::fmt::Debug;
@@ -57,72 +57,139 @@ pub trait Head: Clone + std::fmt::Debug {
 }
 
 /// A protagonist's head: a law of actions.
-pub trait Policy: Head<Given = ()> {
+pub trait PolicyHead: Head<Given = ()> {
     /// Draws an action.
     fn draw(&self, parameters: &[f64], random: &mut impl Rng) -> Self::Choice;
 
     /// The greedy action: the mode of the law.
     fn greedy(&self, parameters: &[f64]) -> Self::Choice;
+
+    /// The probability of each action, appended to `probabilities`; `false`, without appending anything,
+    /// where actions are not finitely many.
+    fn probabilities(&self, parameters: &[f64], probabilities: &mut Vec<f64>) -> bool;
+
+    /// The action of this mode.
+    fn choose(&self, parameters: &[f64], mode: Mode, random: &mut impl Rng) -> Self::Choice {
+        match mode {
+            Mode::Greedy => self.greedy(parameters),
+            Mode::Sampled => self.draw(parameters, random),
+        }
+    }
 }
 
-/// Softmax over the four moves.
-#[derive(Debug, Clone, Copy, Default)]
-pub struct CategoricalPolicy;
+/// A kind of action that has a head; `A` is the action.
+pub trait HeadOf<A: Action> {
+    /// The head.
+    type Head: PolicyHead<Choice = A>;
 
-impl CategoricalPolicy {
-    /// Probabilities of the moves, from logits.
-    pub fn probabilities(logits: &[f64]) -> [f64; MOVES] {
-        Self::softmax(logits).0
+    /// The head with these options.
+    fn head(options: &TrainOptions) -> Self::Head;
+}
+
+impl<A: Discrete> HeadOf<A> for Finite {
+    type Head = CategoricalPolicy<A>;
+
+    fn head(_: &TrainOptions) -> CategoricalPolicy<A> {
+        CategoricalPolicy::default()
     }
+}
 
-    /// Probabilities and log-probabilities of the moves.
-    fn softmax(logits: &[f64]) -> ([f64; MOVES], [f64; MOVES]) {
-        let highest = logits[..MOVES].iter().copied().fold(f64::NEG_INFINITY, f64::max);
-        let weights: [f64; MOVES] = std::array::from_fn(|i| (logits[i] - highest).exp());
+impl HeadOf<Force> for Plane {
+    type Head = GaussianPolicy;
+
+    fn head(options: &TrainOptions) -> GaussianPolicy {
+        GaussianPolicy { initial_std: options.initial_std }
+    }
+}
+
+/// Softmax over finitely many actions.
+#[derive(Debug, Clone, Copy)]
+pub struct CategoricalPolicy<A>(PhantomData<A>);
+
+impl<A> Default for CategoricalPolicy<A> {
+    fn default() -> Self {
+        CategoricalPolicy(PhantomData)
+    }
+}
+
+/// Probabilities of the actions, on the stack where they are few.
+pub type Probabilities = SmallVec<[f64; 8]>;
+
+impl<A: Discrete> CategoricalPolicy<A> {
+    /// Probabilities of the actions, from logits.
+    pub fn softmax(logits: &[f64]) -> Probabilities {
+        let highest = Self::highest(logits);
+        let mut weights: Probabilities =
+            logits[..A::COUNT].iter().map(|logit| (logit - highest).exp()).collect();
         let sum: f64 = weights.iter().sum();
-        let shift = highest + sum.ln();
-        (weights.map(|weight| weight / sum), std::array::from_fn(|i| logits[i] - shift))
+        weights.iter_mut().for_each(|weight| *weight /= sum);
+        weights
+    }
+
+    fn highest(logits: &[f64]) -> f64 {
+        logits[..A::COUNT].iter().copied().fold(f64::NEG_INFINITY, f64::max)
     }
 }
 
-impl Head for CategoricalPolicy {
+impl<A: Discrete> Head for CategoricalPolicy<A> {
     type Given = ();
-    type Choice = Move;
+    type Choice = A;
 
     fn outputs(&self) -> usize {
-        MOVES
+        A::COUNT
     }
 
-    fn log_probability(&self, parameters: &[f64], _: &(), choice: &Move) -> f64 {
-        Self::softmax(parameters).1[choice.index()]
+    fn log_probability(&self, logits: &[f64], _: &(), choice: &A) -> f64 {
+        let highest = Self::highest(logits);
+        let sum: f64 = logits[..A::COUNT].iter().map(|logit| (logit - highest).exp()).sum();
+        logits[choice.index()] - (highest + sum.ln())
     }
 
     fn gradients(
         &self,
-        parameters: &[f64],
+        logits: &[f64],
         _: &(),
-        choice: &Move,
+        choice: &A,
         score: &mut [f64],
         entropy_gradient: &mut [f64],
     ) -> (f64, f64) {
-        let (probabilities, logs) = Self::softmax(parameters);
-        let entropy: f64 = -(0..MOVES).map(|i| probabilities[i] * logs[i]).sum::<f64>();
-        for i in 0..MOVES {
-            score[i] = f64::from(i == choice.index()) - probabilities[i];
-            entropy_gradient[i] = -probabilities[i] * (logs[i] + entropy);
+        // First the probabilities and their logarithms, in place.
+        let highest = Self::highest(logits);
+        let (probabilities, logs) = (&mut score[..A::COUNT], &mut entropy_gradient[..A::COUNT]);
+        for (weight, logit) in probabilities.iter_mut().zip(logits) {
+            *weight = (logit - highest).exp();
         }
-        (logs[choice.index()], entropy)
+        let sum: f64 = probabilities.iter().sum();
+        let shift = highest + sum.ln();
+        for (log, logit) in logs.iter_mut().zip(logits) {
+            *log = logit - shift;
+        }
+        probabilities.iter_mut().for_each(|weight| *weight /= sum);
+        let pairs = probabilities.iter().zip(logs.iter());
+        let entropy = -pairs.map(|(probability, log)| probability * log).sum::<f64>();
+        let log_probability = logs[choice.index()];
+        for (i, (score, by_entropy)) in probabilities.iter_mut().zip(logs).enumerate() {
+            let probability = *score;
+            *score = f64::from(i == choice.index()) - probability;
+            *by_entropy = -probability * (*by_entropy + entropy);
+        }
+        (log_probability, entropy)
     }
 }
 
-impl Policy for CategoricalPolicy {
-    fn draw(&self, parameters: &[f64], random: &mut impl Rng) -> Move {
-        Move::ALL[sample_index(&Self::probabilities(parameters), random)]
+impl<A: Discrete> PolicyHead for CategoricalPolicy<A> {
+    fn draw(&self, logits: &[f64], random: &mut impl Rng) -> A {
+        A::from_index(sample_index(&Self::softmax(logits), random))
     }
 
-    fn greedy(&self, parameters: &[f64]) -> Move {
-        let best = (1..MOVES).fold(0, |b, i| if parameters[i] > parameters[b] { i } else { b });
-        Move::ALL[best]
+    fn greedy(&self, logits: &[f64]) -> A {
+        let best = (1..A::COUNT).fold(0, |best, i| if logits[i] > logits[best] { i } else { best });
+        A::from_index(best)
+    }
+
+    fn probabilities(&self, logits: &[f64], probabilities: &mut Vec<f64>) -> bool {
+        probabilities.extend(Self::softmax(logits));
+        true
     }
 }
 
@@ -183,7 +250,7 @@ impl Head for GaussianPolicy {
     }
 }
 
-impl Policy for GaussianPolicy {
+impl PolicyHead for GaussianPolicy {
     fn draw(&self, parameters: &[f64], random: &mut impl Rng) -> Force {
         let [x, y] = std::array::from_fn(|i| {
             parameters[i] + parameters[2 + i].exp() * random.sample::<f64, _>(StandardNormal)
@@ -193,6 +260,10 @@ impl Policy for GaussianPolicy {
 
     fn greedy(&self, parameters: &[f64]) -> Force {
         Force(Vector2::new(parameters[0], parameters[1]))
+    }
+
+    fn probabilities(&self, _: &[f64], _: &mut Vec<f64>) -> bool {
+        false
     }
 }
 

@@ -15,20 +15,22 @@
 //! dL/dV = dL/dy h' (its diagonal blocks),   dL/dh = V' dL/dy,   dL/dW = (dL/dh * (1 - h^2)) x'.
 //! ```
 //!
-//! All parameters live in one flat vector `[W' | V | b | c]`, where c are the constants of the
-//! actor's head that no observation moves (the log standard deviations of a Gaussian policy).
+//! All parameters are in one flat vector `[W' | V | b | c]`, where c are the constants of the
+//! actor's head, which do not depend on the observation (the log standard deviations of a Gaussian policy).
 //!
-//! The passes are carried out by `fused` on the processor and by `tensors`, which is libtorch, on
-//! other devices; a test holds the two, and libtorch's own derivatives, together.
+//! The passes are computed by `fused` on the processor and by `tensors`, which is libtorch, on
+//! other devices; a test checks that the two agree with each other and with libtorch's own derivatives.
 
 mod fused;
+#[cfg(feature = "torch")]
 mod tensors;
 
+use super::device::Device;
 use fused::Fused;
 use nalgebra::DMatrix;
 use rand::{Rng, RngExt};
 use rand_distr::StandardNormal;
-use tch::Device;
+#[cfg(feature = "torch")]
 use tensors::Tensors;
 
 /// Sizes of a player's networks.
@@ -73,7 +75,7 @@ impl Shape {
         self.bias_at() + self.rows()
     }
 
-    /// Index of W's entry for a hidden unit (the critic's behind the actor's) and an input.
+    /// Index of W's entry for a hidden unit (the critic's after the actor's) and an input.
     pub fn first_at(&self, unit: usize, input: usize) -> usize {
         input * 2 * self.hidden + unit
     }
@@ -102,14 +104,15 @@ pub struct Network {
     engine: Engine,
 }
 
-/// Who carries the passes out.
+/// What computes the passes.
 #[derive(Debug)]
 enum Engine {
     Processor(Fused),
-    Device(Tensors),
+    #[cfg(feature = "torch")]
+    Torch(Tensors),
 }
 
-/// Samples of a batch whose outputs are known and whose loss is asked for.
+/// Samples of a batch with their outputs, for which the loss is to be computed.
 #[derive(Debug)]
 pub struct Outputs<'a> {
     /// Index of the first of them in the batch.
@@ -153,14 +156,18 @@ impl Network {
     pub fn from_parameters(shape: Shape, parameters: Vec<f32>, device: Device) -> Self {
         let engine = match device {
             Device::Cpu => Engine::Processor(Fused::default()),
-            device => Engine::Device(Tensors::new(shape, &parameters, device)),
+            #[cfg(feature = "torch")]
+            device => Engine::Torch(Tensors::new(shape, &parameters, device.into())),
+            #[cfg(not(feature = "torch"))]
+            Device::Cuda(_) => unreachable!("`Device::require` refuses it"),
         };
         Self::with_engine(shape, parameters, engine)
     }
 
-    /// A network with these parameters that libtorch carries out, on the processor as well.
+    /// A network with these parameters that libtorch computes, on the processor as well.
+    #[cfg(feature = "torch")]
     pub fn by_libtorch(shape: Shape, parameters: Vec<f32>, device: Device) -> Self {
-        let engine = Engine::Device(Tensors::new(shape, &parameters, device));
+        let engine = Engine::Torch(Tensors::new(shape, &parameters, device.into()));
         Self::with_engine(shape, parameters, engine)
     }
 
@@ -182,7 +189,8 @@ impl Network {
     /// Changes the parameters.
     pub fn change(&mut self, change: impl FnOnce(&mut [f32])) {
         change(&mut self.parameters);
-        if let Engine::Device(tensors) = &mut self.engine {
+        #[cfg(feature = "torch")]
+        if let Engine::Torch(tensors) = &mut self.engine {
             tensors.upload(&self.parameters);
         }
     }
@@ -192,13 +200,28 @@ impl Network {
         &self.parameters[self.shape.constants_at()..]
     }
 
-    /// Outputs of the actor alone, shape `[k, n]`; `inputs` holds n samples one after the other,
+    /// The first quantity of the network that is not a finite number, or would not be in an evaluation.
+    pub fn not_finite(&self) -> Option<&'static str> {
+        // Inputs are about 1 and tanh units at most 1: with these weights no f32 can overflow.
+        const LARGEST: f32 = 1e15;
+        if !self.parameters.iter().all(|parameter| parameter.is_finite()) {
+            Some("a weight")
+        } else if !self.parameters.iter().all(|parameter| parameter.abs() <= LARGEST) {
+            Some("a network's output")
+        } else if !self.constants().iter().all(|&log| f64::from(log).exp().is_finite()) {
+            Some("a standard deviation")
+        } else {
+            None
+        }
+    }
+
+    /// Outputs of the actor only, shape `[k, n]`; `inputs` holds n samples one after the other,
     /// shape `[n, inputs + 1]`.
     pub fn act(&self, inputs: &[f32], outputs: &mut Vec<f32>) {
         self.evaluate(inputs, false, outputs);
     }
 
-    /// Values of the critic alone, shape `[n]`, for inputs as in [`Network::act`].
+    /// Values of the critic only, shape `[n]`, for inputs as in [`Network::act`].
     pub fn values(&self, inputs: &[f32], values: &mut Vec<f32>) {
         self.evaluate(inputs, true, values);
     }
@@ -209,7 +232,8 @@ impl Network {
             Engine::Processor(_) => {
                 fused::Evaluate { shape, parameters, inputs, critic, outputs }.run();
             }
-            Engine::Device(tensors) => {
+            #[cfg(feature = "torch")]
+            Engine::Torch(tensors) => {
                 tensors.evaluate(inputs, critic, outputs);
                 let bias = shape.bias_at() + if critic { shape.outputs } else { 0 };
                 let rows = if critic { 1 } else { shape.outputs };
@@ -220,7 +244,7 @@ impl Network {
 
     /// Outputs and gradient in one: evaluates y on a batch of inputs as in [`Network::act`], lets
     /// `loss` turn it into dL/dy block by block, and writes dL/d parameters, except for those of the
-    /// constants c, which are left zero.
+    /// constants c, which stay zero.
     pub fn differentiate(
         &mut self,
         inputs: &[f32],
@@ -233,11 +257,13 @@ impl Network {
             Engine::Processor(buffers) => {
                 fused::Differentiate { shape, parameters, inputs, gradient, loss, buffers }.run();
             }
-            Engine::Device(tensors) => tensors.differentiate(parameters, inputs, gradient, loss),
+            #[cfg(feature = "torch")]
+            Engine::Torch(tensors) => tensors.differentiate(parameters, inputs, gradient, loss),
         }
     }
 }
 
+#[cfg(feature = "torch")]
 fn add_bias(outputs: &mut [f32], bias: &[f32]) {
     let samples = outputs.len() / bias.len();
     for (row, bias) in outputs.chunks_exact_mut(samples).zip(bias) {

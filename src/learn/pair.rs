@@ -1,137 +1,222 @@
-//! The two players of a game, and what each of them sees.
+//! The two PPO players of a game, and how they act.
 
-use crate::arena::Arena;
-use crate::head::AntagonistHead;
-use crate::ppo::Player;
-use cvar_game::game::budget::{Budget, Eta};
-use cvar_game::options::{Adversary, Role, TrainOptions};
-use lava_envs::World;
+use super::device::Device;
+use super::family::{self, Antagonist, Reweighting};
+use super::head::{HeadOf, PolicyHead};
+use super::method::{Arena, Players, Setting};
+use super::observation::Observation;
+use super::options::{Adversary, Role};
+use super::policy::{Draw, Mode, Opponent, Policy, Response, Situation, Streams};
+use super::ppo::Player;
+use super::weights::{self, Weights, WeightsError};
 use lava_envs::random::{Purpose, stream};
-use tch::Device;
+use lava_envs::{Action, World};
 
+/// The head of a world's protagonist.
+pub type HeadIn<W> = <<<W as World>::Action as Action>::Kind as HeadOf<<W as World>::Action>>::Head;
 /// The protagonist of a world.
-pub type Protagonist<W> = Player<<W as Arena>::Policy>;
-/// The antagonist of a world.
-pub type Antagonist<W> = Player<AntagonistHead<<W as Arena>::Family>>;
+pub type Protagonist<W> = Player<HeadIn<W>>;
 
 /// The two players of a game.
 #[derive(Debug)]
 pub struct Pair<W: Arena> {
     /// Chooses the actions.
     pub protagonist: Protagonist<W>,
-    /// Reweights chance; absent at eta = 1, where there is nothing it could do.
-    pub antagonist: Option<Antagonist<W>>,
+    /// Reweights chance; absent at eta = 1, where it could not change anything.
+    pub antagonist: Option<Box<dyn Antagonist<W::Law>>>,
     /// What they see.
-    pub views: Views,
-    /// Whether the antagonist plays what its network says, or at random.
+    pub observation: Observation,
+    /// Whether the antagonist follows its network, or plays at random.
     pub adversary: Adversary,
+    device: Device,
 }
 
 impl<W: Arena> Pair<W> {
     /// Two fresh players.
-    pub fn new(options: &TrainOptions, eta: Eta, seed: u64, device: Device) -> Self {
-        let views = Views::new(options, eta);
+    pub fn new(setting: &Setting<'_>) -> Self {
+        let Setting { eta, seed, device, options, .. } = *setting;
+        let observation = Observation::new(options, eta);
         let protagonist = Player::new(
-            W::policy(options),
-            views.protagonist_inputs::<W>(),
+            <W::Action as Action>::Kind::head(options),
+            observation.protagonist_inputs::<W>(),
             options.protagonist.hidden,
             device,
             &mut stream(seed, Purpose::ProtagonistWeights, 0),
         );
         let antagonist = (!eta.is_neutral()).then(|| {
-            Player::new(
-                AntagonistHead(W::family(options)),
-                views.antagonist_inputs::<W>(),
+            family::antagonist(
+                &options.family,
+                observation.antagonist_inputs::<W>(),
                 options.antagonist.hidden,
                 device,
                 &mut stream(seed, Purpose::AntagonistWeights, 0),
             )
         });
-        Pair { protagonist, antagonist, views, adversary: options.adversary }
+        Pair { protagonist, antagonist, observation, adversary: options.adversary, device }
     }
 
-    /// Parameters of a player; empty for an absent one.
+    /// Parameters of a player's networks; empty for an absent one.
     pub fn parameters(&self, role: Role) -> &[f32] {
         match role {
             Role::Protagonist => self.protagonist.network.parameters(),
-            Role::Antagonist => self.antagonist.as_ref().map_or(&[], |a| a.network.parameters()),
+            Role::Antagonist => self.antagonist.as_ref().map_or(&[], |a| a.network().parameters()),
         }
+    }
+
+    /// The antagonist at play, if there is one; `audit` requests the normalisation error, which is
+    /// too slow to compute in training.
+    pub fn opponent(&self, audit: bool) -> Option<LearnedOpponent<'_, W>> {
+        let antagonist = self.antagonist.as_deref()?;
+        let normalisation_error = audit.then_some(0.0);
+        Some(LearnedOpponent {
+            antagonist,
+            pair: self,
+            inputs: Vec::new(),
+            outputs: Vec::new(),
+            normalisation_error,
+        })
     }
 }
 
-/// What the players see.
-///
-/// The protagonist sees the world's observation, and the time if it is time-aware; never the budget:
-/// given that it would solve Chow's decomposition, which is not CVaR-optimal. The antagonist sees
-/// the situation after the action was chosen, its remaining budget as log eta_t / log eta, and the
-/// time if it is time-aware. Every row ends with the constant 1 of the networks' biases.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Views {
-    protagonist_time: bool,
-    antagonist_time: bool,
-    /// 1 / log eta, or 0 where the budget is hidden.
-    budget_scale: f64,
+impl<W: Arena> Players<W> for Pair<W> {
+    fn protagonist(&self) -> Box<dyn Policy<W> + '_> {
+        Box::new(PpoPolicy::new(&self.protagonist, self.observation))
+    }
+
+    fn opponent(&self) -> Option<Box<dyn Opponent<W> + '_>> {
+        Some(Box::new(Pair::opponent(self, true)?))
+    }
+
+    fn weights(&self, about: String) -> Result<Vec<u8>, WeightsError> {
+        let mut networks = vec![(Role::Protagonist, &self.protagonist.network)];
+        networks.extend(self.antagonist.iter().map(|of| (Role::Antagonist, of.network())));
+        weights::to_bytes(&networks, about)
+    }
+
+    fn load(&mut self, bytes: &[u8]) -> Result<(), WeightsError> {
+        let file = Weights::read(bytes)?;
+        let shape = self.protagonist.network.shape();
+        self.protagonist.network = file.network(Role::Protagonist, shape, self.device)?;
+        if let Some(antagonist) = &mut self.antagonist {
+            let shape = antagonist.network().shape();
+            *antagonist.network_mut() = file.network(Role::Antagonist, shape, self.device)?;
+        }
+        Ok(())
+    }
 }
 
-impl Views {
-    /// The views of a game.
-    pub fn new(options: &TrainOptions, eta: Eta) -> Self {
-        let blind = options.hide_budget || eta.is_neutral();
-        Views {
-            protagonist_time: options.protagonist.time_aware,
-            antagonist_time: options.antagonist.time_aware,
-            budget_scale: if blind { 0.0 } else { 1.0 / eta.get().ln() },
-        }
+/// A PPO player's policy at play.
+#[derive(Debug)]
+pub struct PpoPolicy<'a, H: PolicyHead> {
+    player: &'a Player<H>,
+    observation: Observation,
+    /// What it saw in its last step, shape `[slots, inputs + 1]`.
+    pub inputs: Vec<f32>,
+    /// The outputs of its actor for it, shape `[k, slots]`.
+    pub outputs: Vec<f32>,
+    parameters: Vec<f64>,
+}
+
+impl<'a, H: PolicyHead> PpoPolicy<'a, H> {
+    /// The policy of a player.
+    pub fn new(player: &'a Player<H>, observation: Observation) -> Self {
+        let (inputs, outputs, parameters) = Default::default();
+        PpoPolicy { player, observation, inputs, outputs, parameters }
     }
 
-    /// Whether the protagonist sees the time.
-    pub fn protagonist_sees_time(&self) -> bool {
-        self.protagonist_time
+    /// Lets the actor see the world.
+    fn look<W: World>(&mut self, world: &W) {
+        self.observation.protagonist(world, &mut self.inputs);
+        self.player.network.act(&self.inputs, &mut self.outputs);
     }
 
-    /// Numbers that the protagonist sees.
-    pub fn protagonist_inputs<W: World>(&self) -> usize {
-        W::OBSERVATION + usize::from(self.protagonist_time)
+    /// log-probability of a choice in a slot of the last step.
+    pub fn log_probability(&mut self, slot: usize, choice: &H::Choice) -> f64 {
+        self.player.parameters_in(&self.outputs, slot, &mut self.parameters);
+        self.player.head.log_probability(&self.parameters, &(), choice)
     }
+}
 
-    /// Numbers that the antagonist sees.
-    pub fn antagonist_inputs<W: World>(&self) -> usize {
-        W::SITUATION + 1 + usize::from(self.antagonist_time)
-    }
-
-    /// Writes the protagonist's row, shape `[protagonist_inputs + 1]`.
-    pub fn protagonist<W: World>(&self, world: &W, slot: usize, row: &mut [f32]) {
-        world.observe(slot, &mut row[..W::OBSERVATION]);
-        close(world, slot, &mut row[W::OBSERVATION..]);
-    }
-
-    /// Turns rows of the antagonist into those that it would see with exp(`log_factor`) times the
-    /// budget.
-    pub fn enrich<W: World>(&self, rows: &mut [f32], log_factor: f64) {
-        for row in rows.chunks_exact_mut(self.antagonist_inputs::<W>() + 1) {
-            row[W::SITUATION] += (log_factor * self.budget_scale) as f32;
-        }
-    }
-
-    /// Writes the antagonist's row, shape `[antagonist_inputs + 1]`.
-    pub fn antagonist<W: World>(
-        &self,
+impl<W: World, H: PolicyHead<Choice = W::Action>> Policy<W> for PpoPolicy<'_, H> {
+    fn choose(
+        &mut self,
         world: &W,
-        slot: usize,
-        action: W::Action,
-        budget: Budget,
-        row: &mut [f32],
+        mode: Mode,
+        streams: &mut [Streams],
+        actions: &mut Vec<W::Action>,
     ) {
-        world.situation(slot, action, &mut row[..W::SITUATION]);
-        row[W::SITUATION] = (budget.get().ln() * self.budget_scale) as f32;
-        close(world, slot, &mut row[W::SITUATION + 1..]);
+        self.look(world);
+        let PpoPolicy { player, outputs, parameters, .. } = self;
+        actions.extend(streams.iter_mut().enumerate().map(|(slot, streams)| {
+            player.parameters_in(outputs, slot, parameters);
+            player.head.choose(parameters, mode, &mut streams.actions)
+        }));
+    }
+
+    fn probabilities(&mut self, world: &W) -> Option<Vec<f64>> {
+        self.look(world);
+        let mut probabilities = Vec::new();
+        for slot in 0..world.episodes() {
+            self.player.parameters_in(&self.outputs, slot, &mut self.parameters);
+            if !self.player.head.probabilities(&self.parameters, &mut probabilities) {
+                return None;
+            }
+        }
+        Some(probabilities)
+    }
+
+    fn sees_time(&self) -> bool {
+        self.observation.protagonist_sees_time()
     }
 }
 
-/// Writes the time, where there is room for it, and the constant 1.
-fn close<W: World>(world: &W, slot: usize, rest: &mut [f32]) {
-    if let [time, _] = rest {
-        *time = 2.0 * world.time(slot) as f32 / world.horizon() as f32 - 1.0;
+/// A pair's antagonist at play.
+#[derive(Debug)]
+pub struct LearnedOpponent<'a, W: Arena> {
+    antagonist: &'a dyn Antagonist<W::Law>,
+    pair: &'a Pair<W>,
+    /// What it saw in its last step, shape `[slots, inputs + 1]`.
+    pub inputs: Vec<f32>,
+    outputs: Vec<f32>,
+    normalisation_error: Option<f64>,
+}
+
+impl<W: Arena> LearnedOpponent<'_, W> {
+    /// Lets the antagonist see the situation.
+    pub fn look(&mut self, situation: &Situation<'_, W>) {
+        self.pair.observation.antagonist(situation, &mut self.inputs);
     }
-    rest[rest.len() - 1] = 1.0;
+}
+
+impl<W: Arena> Opponent<W> for LearnedOpponent<'_, W> {
+    fn respond(
+        &mut self,
+        situation: &Situation<'_, W>,
+        draw: Draw,
+        streams: &mut [Streams],
+        response: Response<'_, W>,
+    ) {
+        self.look(situation);
+        let outputs = match self.pair.adversary {
+            Adversary::Learned => {
+                self.antagonist.network().act(&self.inputs, &mut self.outputs);
+                Some(&self.outputs[..])
+            }
+            Adversary::Random => None,
+        };
+        self.antagonist.reweight(Reweighting {
+            outputs,
+            laws: situation.laws,
+            budgets: situation.budgets,
+            draw,
+            streams,
+            outcomes: response.outcomes,
+            ratios: response.ratios,
+            normalisation_error: self.normalisation_error.as_mut(),
+        });
+    }
+
+    fn normalisation_error(&self) -> f64 {
+        self.normalisation_error.unwrap_or(0.0)
+    }
 }

@@ -1,22 +1,23 @@
-//! Evaluation: whole episodes of a trained pair, each on random streams of its own.
+//! Evaluation: whole episodes of a protagonist and an opponent, each on random streams of its own.
 //!
-//! The streams of an episode depend on the evaluation's seed and the episode's index alone, so all
+//! The streams of an episode depend only on the evaluation's seed and the episode's index, so all
 //! policies meet the same chance (common random numbers), and no episode depends on how many are
 //! played at once.
 
-use crate::arena::Arena;
-use crate::contest::{Chance, Choosing, Contest, Streams};
-use crate::pair::Pair;
-use cvar_game::game::budget::Eta;
-use cvar_game::game::returns::{Atom, ReturnLaw};
+use super::policy::{Draw, Mode, Opponent, Policy, Streams};
+use super::vector_game::VectorGame;
+use crate::game::budget::Eta;
+use crate::game::returns::{Atom, ReturnLaw, ReturnSoFar};
 use lava_envs::random::{Purpose, stream};
+use lava_envs::{End, World};
 
-/// What is played.
-pub struct Play<'a, W: Arena> {
+/// How episodes are played.
+#[derive(Debug, Clone, Copy)]
+pub struct Play {
     /// How the protagonist picks its actions.
-    pub choosing: Choosing,
-    /// Who decides the law of chance.
-    pub chance: Chance<'a, W>,
+    pub mode: Mode,
+    /// The law that outcomes are drawn from.
+    pub draw: Draw,
     /// Budget.
     pub eta: Eta,
     /// Discount factor.
@@ -36,20 +37,6 @@ pub struct Episode {
     pub clearance: f64,
     /// prod_t delta_t(o_t).
     pub likelihood_ratio: f64,
-}
-
-impl Episode {
-    const START: Episode = Episode {
-        atom: Atom {
-            value: 0.0,
-            undiscounted: 0.0,
-            steps: 0,
-            end: lava_envs::End::Timeout,
-            mass: 1.0,
-        },
-        clearance: f64::INFINITY,
-        likelihood_ratio: 1.0,
-    };
 }
 
 /// What was played.
@@ -75,82 +62,99 @@ impl Played {
     }
 }
 
-/// Somebody who is shown every step of every episode. Steps of one episode come in order, those of
-/// different episodes in between each other.
-pub trait Watcher<W: Arena> {
+/// An observer of every step of every episode. Steps of one episode come in order, those of
+/// different episodes are interleaved.
+pub trait Watcher<W: World> {
     /// The world before the next step of the episode in the slot.
     fn before(&mut self, world: &W, slot: usize);
 
-    /// What happened in that step of the episode; the world is the one after it.
-    fn after(&mut self, contest: &Contest<W>, slot: usize, episode: usize);
+    /// What happened in that step of the episode; the world is the one after it. `so_far` is the
+    /// episode's return up to this step, which is included.
+    fn after(&mut self, game: &VectorGame<W>, slot: usize, episode: usize, so_far: &ReturnSoFar);
 
-    /// Whether the rest need not be played.
+    /// Whether the remaining episodes need not be played.
     fn has_enough(&self) -> bool {
         false
     }
 }
 
-/// Nobody.
-impl<W: Arena> Watcher<W> for () {
+/// An observer that ignores all steps.
+impl<W: World> Watcher<W> for () {
     fn before(&mut self, _: &W, _: usize) {}
 
-    fn after(&mut self, _: &Contest<W>, _: usize, _: usize) {}
+    fn after(&mut self, _: &VectorGame<W>, _: usize, _: usize, _: &ReturnSoFar) {}
+}
+
+/// An episode that is being played.
+#[derive(Debug, Clone, Copy)]
+struct Running {
+    index: usize,
+    so_far: ReturnSoFar,
+    clearance: f64,
+    likelihood_ratio: f64,
+}
+
+impl Running {
+    fn start(index: usize) -> Self {
+        let (clearance, likelihood_ratio) = (f64::INFINITY, 1.0);
+        Running { index, so_far: ReturnSoFar::START, clearance, likelihood_ratio }
+    }
+
+    fn ended(self, end: End) -> Episode {
+        let Running { so_far, clearance, likelihood_ratio, .. } = self;
+        Episode { atom: so_far.ended(end), clearance, likelihood_ratio }
+    }
 }
 
 /// Plays the episodes in the slots of `world`; a slot takes the next episode when its own has ended.
-/// Once the watcher has enough, what was not played yet stays without meaning.
-pub fn play<W: Arena>(
+/// After the watcher has asked to stop, the episodes that were not played yet have no meaning.
+pub fn play<W: World>(
     world: W,
-    pair: &Pair<W>,
-    play: &Play<'_, W>,
-    watcher: &mut impl Watcher<W>,
+    protagonist: &mut dyn Policy<W>,
+    opponent: &mut dyn Opponent<W>,
+    play: &Play,
+    watcher: &mut dyn Watcher<W>,
 ) -> Played {
     let slots = world.episodes();
-    let mut contest =
-        Contest::new(world, (0..slots as u64).map(|i| play.streams(i)).collect(), &pair.views);
-    contest.audit = true;
-    let mut played = vec![Episode::START; play.episodes as usize];
-    // The episode in each slot.
-    let mut current: Vec<usize> = (0..slots).collect();
+    let mut game = VectorGame::new(world, (0..slots as u64).map(|i| play.streams(i)).collect());
+    let mut played = vec![Running::start(0).ended(End::Timeout); play.episodes as usize];
+    let mut running: Vec<Running> = (0..slots).map(Running::start).collect();
     let mut next = slots;
-    for (slot, &episode) in current.iter().enumerate() {
-        contest.start(slot, play.eta);
-        contest.idle[slot] = episode >= played.len();
+    for (slot, episode) in running.iter().enumerate() {
+        game.start(slot, play.eta);
+        game.idle[slot] = episode.index >= played.len();
     }
-    while contest.idle.iter().any(|idle| !idle) && !watcher.has_enough() {
-        for slot in (0..slots).filter(|&slot| !contest.idle[slot]) {
-            watcher.before(&contest.world, slot);
+    while game.idle.iter().any(|idle| !idle) && !watcher.has_enough() {
+        for slot in (0..slots).filter(|&slot| !game.idle[slot]) {
+            watcher.before(&game.world, slot);
         }
-        contest.step(pair, play.choosing, &play.chance);
-        for (slot, index) in current.iter_mut().enumerate() {
-            if contest.idle[slot] {
+        game.step(protagonist, play.mode, opponent, play.draw);
+        for (slot, episode) in running.iter_mut().enumerate() {
+            if game.idle[slot] {
                 continue;
             }
-            watcher.after(&contest, slot, *index);
-            let episode = &mut played[*index];
-            let step = contest.steps[slot];
-            episode.atom.value += play.gamma.powi(episode.atom.steps as i32) * step.reward;
-            episode.atom.undiscounted += step.reward;
-            episode.atom.steps += 1;
-            episode.clearance = episode.clearance.min(contest.world.clearance(slot));
-            episode.likelihood_ratio *= contest.ratios[slot];
+            let step = game.steps[slot];
+            episode.so_far.add(step.reward, play.gamma);
+            episode.clearance = episode.clearance.min(game.world.clearance(slot));
+            episode.likelihood_ratio *= game.ratios[slot];
+            watcher.after(&game, slot, episode.index, &episode.so_far);
             if let Some(end) = step.end {
-                episode.atom.end = end;
-                *index = next;
+                played[episode.index] = episode.ended(end);
+                *episode = Running::start(next);
                 next += 1;
-                if *index < played.len() {
-                    contest.start(slot, play.eta);
-                    contest.streams[slot] = play.streams(*index as u64);
+                if episode.index < played.len() {
+                    game.start(slot, play.eta);
+                    game.streams[slot] = play.streams(episode.index as u64);
                 } else {
-                    contest.idle[slot] = true;
+                    game.idle[slot] = true;
                 }
             }
         }
     }
-    Played { episodes: played, normalisation_error: contest.normalisation_error }
+    Played { episodes: played, normalisation_error: opponent.normalisation_error() }
 }
 
-impl<W: Arena> Play<'_, W> {
+impl Play {
     fn streams(&self, episode: u64) -> Streams {
         Streams {
             actions: stream(self.seed, Purpose::EvaluationActions, episode),

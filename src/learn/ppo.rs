@@ -7,20 +7,20 @@
 //! -min(r A, clip(r, 1 - eps, 1 + eps) A) - c_entropy H + c_value (V - R)^2,    R = A_gae + V_old.
 //! ```
 //!
-//! Its gradient by the outputs of actor and critic is written out in [`Loss`]; the networks carry it
+//! Its gradient by the outputs of actor and critic is written out in [`Loss`]; the networks propagate it
 //! to the parameters.
 
-use crate::adam::Adam;
-use crate::checkpoint::{PlayerState, Unfit};
-use crate::gae;
-use crate::head::{Head, MAX_PARAMETERS};
-use crate::network::{Network, Outputs, Shape};
-use crate::price::Spending;
-use crate::trajectories::Trajectories;
-use cvar_game::options::PlayerOptions;
+use crate::learn::adam::Adam;
+use crate::learn::budget_sensitivity::BudgetSensitivity;
+use crate::learn::device::Device;
+use crate::learn::gae;
+use crate::learn::head::Head;
+use crate::learn::network::{Network, Outputs, Shape};
+use crate::learn::options::PlayerOptions;
+use crate::learn::state::{PlayerState, Unfit};
+use crate::learn::trajectories::Trajectories;
 use lava_envs::random::ChaCha8Rng;
 use rand::seq::SliceRandom;
-use tch::Device;
 
 /// A player: the head that gives its outputs a meaning, its networks and its optimiser.
 #[derive(Debug)]
@@ -33,7 +33,7 @@ pub struct Player<H: Head> {
     workspace: Workspace<H>,
 }
 
-/// What an update fills; kept, as fresh memory costs more than filling it.
+/// Buffers of an update; they are kept because allocating them costs more than filling them.
 #[derive(Debug)]
 struct Workspace<H: Head> {
     values: Vec<f32>,
@@ -70,7 +70,7 @@ pub struct Losses {
     pub entropy: f64,
     /// Schulman's low-variance estimate of KL(old || new): mean of (r - 1) - log r.
     pub approx_kl: f64,
-    /// Share of samples whose ratio lies outside the clip range.
+    /// Share of samples whose ratio is outside the clip range.
     pub clip_fraction: f64,
     /// Norm of the gradient before clipping.
     pub gradient_norm: f64,
@@ -142,26 +142,13 @@ impl<H: Head> Player<H> {
     /// A player with a given network and a fresh optimiser.
     pub fn with_network(head: H, network: Network) -> Self {
         let shape = network.shape();
-        assert!(shape.outputs + shape.constants <= MAX_PARAMETERS, "parameters of the head");
         let optimiser = Adam::new(shape.parameters());
         Player { head, network, optimiser, workspace: Workspace::default() }
     }
 
-    /// What of the player is not a finite number, or will not be when it plays.
+    /// The first quantity of the player that is not a finite number, or would not be in play.
     pub fn not_finite(&self) -> Option<&'static str> {
-        // Inputs are about 1 and tanh units at most 1: with these weights no f32 can overflow.
-        const LARGEST: f32 = 1e15;
-        let constants = self.network.constants();
-        let parameters = self.network.parameters();
-        if !parameters.iter().all(|parameter| parameter.is_finite()) {
-            Some("a weight")
-        } else if !parameters.iter().all(|parameter| parameter.abs() <= LARGEST) {
-            Some("a network's output")
-        } else if !constants.iter().all(|&log| f64::from(log).exp().is_finite()) {
-            Some("a standard deviation")
-        } else {
-            None
-        }
+        self.network.not_finite()
     }
 
     /// All that the next updates depend on.
@@ -172,7 +159,7 @@ impl<H: Head> Player<H> {
         }
     }
 
-    /// Goes on from a state.
+    /// Continues from a state.
     ///
     /// # Errors
     /// If it is of another network or not finite.
@@ -187,24 +174,27 @@ impl<H: Head> Player<H> {
         self.not_finite().map_or(Ok(()), |_| Err(Unfit("a player's")))
     }
 
-    /// Parameters of the head in a slot: the actor's outputs there, of shape `[k, slots]`, and the
-    /// head's constants.
-    pub fn parameters_in(&self, outputs: &[f32], slot: usize) -> [f64; MAX_PARAMETERS] {
-        let slots = outputs.len() / self.network.shape().outputs;
-        let numbers = outputs.iter().skip(slot).step_by(slots).chain(self.network.constants());
-        let mut parameters = [0.0; MAX_PARAMETERS];
-        for (parameter, &number) in parameters.iter_mut().zip(numbers) {
-            *parameter = f64::from(number);
+    /// Writes the parameters of the head in a slot: the actor's outputs there, of shape `[k, slots]`,
+    /// and the head's constants.
+    pub fn parameters_in(&self, outputs: &[f32], slot: usize, parameters: &mut Vec<f64>) {
+        let shape = self.network.shape();
+        let slots = outputs.len() / shape.outputs;
+        parameters.resize(shape.outputs + shape.constants, 0.0);
+        let (own, constants) = parameters.split_at_mut(shape.outputs);
+        for (parameter, row) in own.iter_mut().zip(outputs.chunks_exact(slots)) {
+            *parameter = f64::from(row[slot]);
         }
-        parameters
+        for (parameter, &constant) in constants.iter_mut().zip(self.network.constants()) {
+            *parameter = f64::from(constant);
+        }
     }
 
     /// One update on the trajectories of a rollout: epochs of minibatches in random order. The
     /// advantages are charged for what was spent, where that is given.
     pub fn update(
         &mut self,
-        trajectories: &Trajectories<H>,
-        spending: Option<&Spending>,
+        trajectories: &Trajectories<H::Given, H::Choice>,
+        sensitivity: Option<&BudgetSensitivity>,
         gamma: f64,
         options: &PlayerOptions,
         rates: Rates,
@@ -230,8 +220,8 @@ impl<H: Head> Player<H> {
             advantage: advantages[i],
             target: advantages[i] + values[i],
         }));
-        if let Some(spending) = spending {
-            spending.charge(advantages, &trajectories.ended, gamma);
+        if let Some(sensitivity) = sensitivity {
+            sensitivity.charge(advantages, &trajectories.ended, gamma);
             for (sample, &advantage) in samples.iter_mut().zip(&*advantages) {
                 sample.advantage = advantage;
             }
@@ -280,11 +270,11 @@ pub struct Loss<'a, H: Head> {
     mean: f64,
     /// 1 over their standard deviation.
     scale: f64,
-    /// Number of the head's parameters.
-    count: usize,
-    /// Them; the constants are in place.
-    parameters: [f64; MAX_PARAMETERS],
-    by_constants: [f64; MAX_PARAMETERS],
+    /// Parameters of the head; the constants are in place.
+    parameters: Vec<f64>,
+    by_constants: Vec<f64>,
+    score: Vec<f64>,
+    by_entropy: Vec<f64>,
     losses: Losses,
 }
 
@@ -302,12 +292,9 @@ impl<'a, H: Head> Loss<'a, H> {
         let variance = samples.iter().map(|s| (f64::from(s.advantage) - mean).powi(2)).sum::<f64>()
             / (number - 1.0).max(1.0);
         let scale = 1.0 / (variance.sqrt() + 1e-8);
-        let mut parameters = [0.0; MAX_PARAMETERS];
-        for (parameter, &constant) in parameters[head.outputs()..].iter_mut().zip(constants) {
-            *parameter = f64::from(constant);
-        }
-        let count = head.outputs() + constants.len();
-        let (by_constants, losses) = ([0.0; MAX_PARAMETERS], Losses::default());
+        let mut parameters = vec![0.0; head.outputs()];
+        parameters.extend(constants.iter().map(|&constant| f64::from(constant)));
+        let count = parameters.len();
         Loss {
             head,
             samples,
@@ -315,10 +302,11 @@ impl<'a, H: Head> Loss<'a, H> {
             entropy_weight,
             mean,
             scale,
-            count,
             parameters,
-            by_constants,
-            losses,
+            by_constants: vec![0.0; count],
+            score: vec![0.0; count],
+            by_entropy: vec![0.0; count],
+            losses: Losses::default(),
         }
     }
 
@@ -328,19 +316,13 @@ impl<'a, H: Head> Loss<'a, H> {
         let options = self.options;
         let share = 1.0 / self.samples.len() as f64;
         let outputs = self.head.outputs();
-        let (mut score, mut by_entropy) = ([0.0; MAX_PARAMETERS], [0.0; MAX_PARAMETERS]);
-        let losses = &mut self.losses;
+        let Loss { parameters, score, by_entropy, by_constants, losses, .. } = self;
         for (column, sample) in self.samples[start..start + samples].iter().enumerate() {
-            for (i, parameter) in self.parameters[..outputs].iter_mut().enumerate() {
+            for (i, parameter) in parameters[..outputs].iter_mut().enumerate() {
                 *parameter = f64::from(y[i * stride + column]);
             }
-            let (log_probability, entropy) = self.head.gradients(
-                &self.parameters[..self.count],
-                &sample.given,
-                &sample.choice,
-                &mut score[..self.count],
-                &mut by_entropy[..self.count],
-            );
+            let (log_probability, entropy) =
+                self.head.gradients(parameters, &sample.given, &sample.choice, score, by_entropy);
             let log_ratio = log_probability - sample.log_probability;
             let ratio = log_ratio.exp();
             let advantage = (f64::from(sample.advantage) - self.mean) * self.scale;
@@ -368,13 +350,13 @@ impl<'a, H: Head> Loss<'a, H> {
             for i in 0..outputs {
                 y[i * stride + column] = gradient(i) as f32;
             }
-            for (i, sum) in self.by_constants[outputs..self.count].iter_mut().enumerate() {
+            for (i, sum) in by_constants[outputs..].iter_mut().enumerate() {
                 *sum += gradient(outputs + i);
             }
         }
     }
 
-    /// Writes the gradient by the head's constants and answers with the losses.
+    /// Writes the gradient by the head's constants and returns the losses.
     pub fn finish(self, by_constants: &mut [f32]) -> Losses {
         for (slot, value) in by_constants.iter_mut().zip(&self.by_constants[self.head.outputs()..])
         {
@@ -384,7 +366,7 @@ impl<'a, H: Head> Loss<'a, H> {
     }
 }
 
-/// Scales the gradient down to `limit` if it is longer; returns its norm before.
+/// Scales the gradient down to `limit` if it is longer; returns its norm before that.
 fn clip_norm(gradient: &mut [f32], limit: f64) -> f64 {
     let norm = gradient.iter().map(|&g| f64::from(g) * f64::from(g)).sum::<f64>().sqrt();
     if norm > limit {

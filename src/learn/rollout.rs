@@ -1,53 +1,66 @@
 //! Rollouts: a fixed number of steps of parallel games, recorded for both players.
 
-use crate::arena::Arena;
-use crate::checkpoint::{GamesState, Running, SlotState, Unfit};
-use crate::contest::{Chance, Choosing, Contest, Streams};
-use crate::head::{AntagonistHead, Head};
-use crate::pair::Pair;
-use crate::trajectories::Trajectories;
-use cvar_game::game::budget::{Budget, Eta};
-use cvar_game::game::returns::Atom;
-use cvar_game::options::{Credit, TrainOptions};
+use super::family::Played;
+use super::method::{Arena, Setting};
+use super::options::{Credit, TrainOptions};
+use super::pair::{LearnedOpponent, Pair, PpoPolicy};
+use super::policy::{Draw, Mode, Nominal, Opponent, Streams};
+use super::state::{GamesState, SlotState, Unfit};
+use super::trajectories::Trajectories;
+use super::vector_game::VectorGame;
+use crate::game::budget::{Budget, Eta};
+use crate::game::returns::{Atom, ReturnSoFar};
 use lava_envs::random::{Purpose, position, stream, stream_from};
-use lava_envs::{End, Law};
+use lava_envs::{End, Law, World};
 
 /// Plays and records.
-pub struct Collector<W: Arena> {
-    contest: Contest<W>,
+pub struct Collector<W: World> {
+    game: VectorGame<W>,
     /// The budget that each slot's episode started with; it differs while the budget rises.
     start: Vec<Eta>,
-    running: Vec<Running>,
+    so_far: Vec<ReturnSoFar>,
+    /// prod delta of each slot's episode so far.
+    products: Vec<f64>,
     gamma: f64,
     /// What the protagonist recorded in the last rollout.
-    pub protagonist: Trajectories<W::Policy>,
-    /// What the antagonist recorded; empty if it took no part.
-    pub antagonist: Trajectories<AntagonistHead<W::Family>>,
-    /// Episodes that ended in the last rollout, their masses of no meaning.
+    pub protagonist: Trajectories<(), W::Action>,
+    /// What the antagonist recorded; empty if it did not play.
+    pub antagonist: Played<W::Law>,
+    /// Episodes that ended in the last rollout; their masses have no meaning.
     pub finished: Vec<Atom>,
     /// max prod delta / eta over all trajectories so far, at most 1 up to rounding.
     pub budget_use: f64,
 }
 
+/// How a rollout is played.
+#[derive(Debug, Clone, Copy)]
+pub struct Terms {
+    /// Budget of the episodes that start in it. At budget 1 it is played without the antagonist.
+    pub eta: Eta,
+    /// How the protagonist picks its actions.
+    pub mode: Mode,
+}
+
 impl<W: Arena> Collector<W> {
     /// Games in all slots of `world`, not yet started.
-    pub fn new(world: W, pair: &Pair<W>, gamma: f64, seed: u64) -> Self {
+    pub fn new(world: W, setting: &Setting<'_>) -> Self {
         let slots = world.episodes();
         let streams = (0..slots as u64)
             .map(|slot| Streams {
-                actions: stream(seed, Purpose::Actions, slot),
-                outcomes: stream(seed, Purpose::Outcomes, slot),
+                actions: stream(setting.seed, Purpose::Actions, slot),
+                outcomes: stream(setting.seed, Purpose::Outcomes, slot),
             })
             .collect();
-        let mut contest = Contest::new(world, streams, &pair.views);
+        let mut game = VectorGame::new(world, streams);
         for slot in 0..slots {
-            contest.start(slot, Eta::NEUTRAL);
+            game.start(slot, Eta::NEUTRAL);
         }
         Collector {
-            contest,
+            game,
             start: vec![Eta::NEUTRAL; slots],
-            running: vec![Running::START; slots],
-            gamma,
+            so_far: vec![ReturnSoFar::START; slots],
+            products: vec![1.0; slots],
+            gamma: setting.gamma,
             protagonist: Trajectories::new(slots),
             antagonist: Trajectories::new(slots),
             finished: Vec::new(),
@@ -55,134 +68,130 @@ impl<W: Arena> Collector<W> {
         }
     }
 
-    /// Plays the steps of a rollout in every slot; episodes that end are followed by new ones. New
-    /// episodes start with budget `eta`; a game at budget 1 is played without the antagonist.
-    pub fn collect(
-        &mut self,
-        pair: &Pair<W>,
-        eta: Eta,
-        choosing: Choosing,
-        options: &TrainOptions,
-    ) {
+    /// Plays the steps of a rollout in every slot; an episode that ends is followed by a new one.
+    pub fn collect(&mut self, pair: &Pair<W>, terms: Terms, options: &TrainOptions) {
         self.protagonist.clear();
         self.antagonist.clear();
         self.finished.clear();
-        let chance = if eta.is_neutral() { Chance::Nominal } else { Chance::Antagonist };
-        for slot in 0..self.contest.slots() {
+        let mut policy = PpoPolicy::new(&pair.protagonist, pair.observation);
+        let mut opponent = if terms.eta.is_neutral() { None } else { pair.opponent(false) };
+        for slot in 0..self.game.slots() {
             // No step was made yet: the episode has this budget as well.
-            if self.contest.world.time(slot) == 0 {
-                self.begin(slot, eta);
+            if self.game.world.time(slot) == 0 {
+                self.begin(slot, terms.eta);
             }
         }
         for _ in 0..options.rollout_steps {
-            self.contest.step(pair, choosing, &chance);
-            self.record_protagonist(pair, options.credit);
-            if !eta.is_neutral() {
-                self.record_antagonist();
+            let chance: &mut dyn Opponent<W> = match &mut opponent {
+                Some(opponent) => opponent,
+                None => &mut Nominal,
+            };
+            self.game.step(&mut policy, terms.mode, chance, Draw::Perturbed);
+            self.record_protagonist(&mut policy, options.credit);
+            if let Some(opponent) = &opponent {
+                self.record_antagonist(opponent);
             }
-            for slot in 0..self.contest.slots() {
-                self.count(slot, eta);
+            for slot in 0..self.game.slots() {
+                self.count(slot, terms.eta);
             }
         }
         // The states after the last step. The antagonist's state holds an action: one is drawn for
-        // this purpose alone, which leaves its value unbiased.
-        self.contest.choose(&pair.protagonist, &pair.views, choosing);
-        self.protagonist.inputs.extend_from_slice(&self.contest.protagonist_inputs);
-        if !eta.is_neutral() {
-            self.contest.show_antagonist(&pair.views);
-            self.antagonist.inputs.extend_from_slice(&self.contest.antagonist_inputs);
+        // this purpose only, which leaves its value unbiased.
+        self.game.choose(&mut policy, terms.mode);
+        self.protagonist.inputs.extend_from_slice(&policy.inputs);
+        if let Some(opponent) = &mut opponent {
+            opponent.look(&self.game.situation());
+            self.antagonist.inputs.extend_from_slice(&opponent.inputs);
         }
     }
 
     fn begin(&mut self, slot: usize, eta: Eta) {
-        self.contest.start(slot, eta);
+        self.game.start(slot, eta);
         self.start[slot] = eta;
-        self.running[slot] = Running::START;
+        self.so_far[slot] = ReturnSoFar::START;
+        self.products[slot] = 1.0;
     }
 
-    fn record_protagonist(&mut self, pair: &Pair<W>, credit: Credit) {
-        let contest = &self.contest;
-        let record = &mut self.protagonist;
-        record.inputs.extend_from_slice(&contest.protagonist_inputs);
-        for slot in 0..contest.slots() {
+    fn record_protagonist(
+        &mut self,
+        policy: &mut PpoPolicy<'_, super::pair::HeadIn<W>>,
+        credit: Credit,
+    ) {
+        let (game, record) = (&self.game, &mut self.protagonist);
+        record.inputs.extend_from_slice(&policy.inputs);
+        for slot in 0..game.slots() {
             let choice = match credit {
                 Credit::Chosen => None,
-                Credit::Executed => W::executed(contest.outcomes[slot]),
+                Credit::Executed => W::executed(game.outcomes[slot]),
             }
-            .unwrap_or(contest.actions[slot]);
-            let parameters = pair.protagonist.parameters_in(&contest.protagonist_outputs, slot);
-            let log_probability = pair.protagonist.head.log_probability(&parameters, &(), &choice);
+            .unwrap_or(game.actions[slot]);
             record.given.push(());
             record.choices.push(choice);
-            record.log_probabilities.push(log_probability);
-            record.rewards.push(contest.steps[slot].reward as f32);
-            record.ended.push(contest.steps[slot].end.is_some());
+            record.log_probabilities.push(policy.log_probability(slot, &choice));
+            record.rewards.push(game.steps[slot].reward as f32);
+            record.ended.push(game.steps[slot].end.is_some());
         }
     }
 
-    fn record_antagonist(&mut self) {
-        let contest = &self.contest;
-        let record = &mut self.antagonist;
-        record.inputs.extend_from_slice(&contest.antagonist_inputs);
-        for slot in 0..contest.slots() {
-            let (law, outcome) = (contest.laws[slot], contest.outcomes[slot]);
-            record.given.push((law, contest.budgets_before[slot]));
+    fn record_antagonist(&mut self, opponent: &LearnedOpponent<'_, W>) {
+        let (game, record) = (&self.game, &mut self.antagonist);
+        record.inputs.extend_from_slice(&opponent.inputs);
+        for slot in 0..game.slots() {
+            let (law, outcome) = (game.laws[slot], game.outcomes[slot]);
+            record.given.push((law, game.budgets_before[slot]));
             record.choices.push(outcome);
             // The antagonist's law is the perturbed law: log(P_t(o) delta_t(o)).
-            record.log_probabilities.push(law.log_density(outcome) + contest.ratios[slot].ln());
-            record.rewards.push(-contest.steps[slot].reward as f32);
-            record.ended.push(contest.steps[slot].end.is_some());
+            record.log_probabilities.push(law.log_density(outcome) + game.ratios[slot].ln());
+            record.rewards.push(-game.steps[slot].reward as f32);
+            record.ended.push(game.steps[slot].end.is_some());
         }
     }
 
-    /// Books the last step of a slot, and begins anew behind the end of an episode.
+    /// Accumulates the last step of a slot, and starts a new episode when its own has ended.
     fn count(&mut self, slot: usize, eta: Eta) {
-        let step = self.contest.steps[slot];
-        let running = &mut self.running[slot];
-        running.value += running.discount * step.reward;
-        running.undiscounted += step.reward;
-        running.discount *= self.gamma;
-        running.steps += 1;
-        running.product *= self.contest.ratios[slot];
+        let step = self.game.steps[slot];
+        self.so_far[slot].add(step.reward, self.gamma);
+        self.products[slot] *= self.game.ratios[slot];
         if let Some(end) = step.end {
-            let Running { value, undiscounted, steps, product, .. } = *running;
-            self.finished.push(Atom { value, undiscounted, steps, end, mass: 1.0 });
-            self.budget_use = self.budget_use.max(product / self.start[slot].get());
+            self.finished.push(self.so_far[slot].ended(end));
+            self.budget_use = self.budget_use.max(self.products[slot] / self.start[slot].get());
             self.begin(slot, eta);
         }
     }
 
-    /// All that the next rollouts depend on beside the players.
+    /// All that the next rollouts depend on besides the players.
     pub fn state(&self) -> GamesState<W::Snapshot> {
         let slot = |slot: usize| SlotState {
-            episode: self.contest.world.snapshot(slot),
-            budget: self.contest.budgets[slot].get(),
+            episode: self.game.world.snapshot(slot),
+            budget: self.game.budgets[slot].get(),
             start: self.start[slot].get(),
-            running: self.running[slot],
-            actions: position(&self.contest.streams[slot].actions),
-            outcomes: position(&self.contest.streams[slot].outcomes),
+            so_far: self.so_far[slot],
+            product: self.products[slot],
+            actions: position(&self.game.streams[slot].actions),
+            outcomes: position(&self.game.streams[slot].outcomes),
         };
-        let slots = (0..self.contest.slots()).map(slot).collect();
+        let slots = (0..self.game.slots()).map(slot).collect();
         GamesState { slots, budget_use: self.budget_use }
     }
 
-    /// Goes on from a state of a run with this seed.
+    /// Continues from a state of a run with this seed.
     ///
     /// # Errors
     /// If the state is of other games; part of it may be in place then.
     pub fn restore(&mut self, state: &GamesState<W::Snapshot>, seed: u64) -> Result<(), Unfit> {
-        if state.slots.len() != self.contest.slots() {
+        if state.slots.len() != self.game.slots() {
             return Err(Unfit("the games'"));
         }
         for (slot, there) in state.slots.iter().enumerate() {
-            let restored = self.contest.world.restore(slot, there.episode);
+            let restored = self.game.world.restore(slot, there.episode);
             restored.map_err(|_| Unfit("the world's"))?;
             let refused = |_| Unfit("the budget's");
-            self.contest.budgets[slot] = Budget::remaining(there.budget).map_err(refused)?;
+            self.game.budgets[slot] = Budget::remaining(there.budget).map_err(refused)?;
             self.start[slot] = Eta::new(there.start).map_err(refused)?;
-            self.running[slot] = there.running;
+            self.so_far[slot] = there.so_far;
+            self.products[slot] = there.product;
             let index = slot as u64;
-            self.contest.streams[slot] = Streams {
+            self.game.streams[slot] = Streams {
                 actions: stream_from(seed, Purpose::Actions, index, there.actions),
                 outcomes: stream_from(seed, Purpose::Outcomes, index, there.outcomes),
             };
@@ -196,7 +205,7 @@ impl<W: Arena> Collector<W> {
         self.finished.iter().map(|e| e.undiscounted).sum::<f64>() / self.finished.len() as f64
     }
 
-    /// Share of the ended episodes that ended so.
+    /// Share of the finished episodes with this end.
     pub fn share(&self, end: End) -> f64 {
         let count = self.finished.iter().filter(|e| e.end == end).count();
         count as f64 / self.finished.len() as f64

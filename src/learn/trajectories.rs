@@ -1,19 +1,18 @@
-//! What a rollout records for one player, and its update learns from.
+//! What a rollout records for one player, for its update to learn from.
 
-use crate::head::Head;
-
-/// What one player saw, chose and earned. Time-major: index `t * slots + slot`.
+/// What one player saw, chose and earned. Time-major: index `t * slots + slot`. `G` is what the law
+/// of the choice depended on besides the network's outputs, `C` the choice.
 #[derive(Debug, Clone)]
-pub struct Trajectories<H: Head> {
+pub struct Trajectories<G, C> {
     /// Number of slots.
     pub slots: usize,
     /// Inputs, shape `[steps + 1, slots, inputs + 1]`; the last block is the state after the last
     /// step, for bootstrapping.
     pub inputs: Vec<f32>,
     /// What the law depended on, `[steps, slots]`.
-    pub given: Vec<H::Given>,
+    pub given: Vec<G>,
     /// Choices, `[steps, slots]`.
-    pub choices: Vec<H::Choice>,
+    pub choices: Vec<C>,
     /// log-probabilities of the choices, `[steps, slots]`.
     pub log_probabilities: Vec<f64>,
     /// The player's own rewards, `[steps, slots]`.
@@ -22,8 +21,8 @@ pub struct Trajectories<H: Head> {
     pub ended: Vec<bool>,
 }
 
-impl<H: Head> Trajectories<H> {
-    /// None yet, of `slots` parallel episodes.
+impl<G, C> Trajectories<G, C> {
+    /// Empty, for `slots` parallel episodes.
     pub fn new(slots: usize) -> Self {
         Trajectories {
             slots,
@@ -36,7 +35,7 @@ impl<H: Head> Trajectories<H> {
         }
     }
 
-    /// Forgets what was recorded.
+    /// Clears the records.
     pub fn clear(&mut self) {
         self.inputs.clear();
         self.given.clear();

@@ -10,15 +10,11 @@
 //!
 //! PLAYER is `protagonist` or `antagonist`; all f32. `outputs(x) = W2 tanh(W1 x + b1) + b2`.
 
-use crate::arena::Arena;
-use crate::head::Head;
-use crate::network::{Network, Shape};
-use crate::pair::Pair;
-use crate::ppo::Player;
-use cvar_game::options::Role;
+use super::device::Device;
+use super::network::{Network, Shape};
+use super::options::Role;
 use safetensors::tensor::{Dtype, SafeTensorError, SafeTensors, TensorView};
 use std::collections::{BTreeMap, HashMap};
-use tch::Device;
 
 /// Why a file holds no weights of the pair.
 #[derive(Debug, thiserror::Error)]
@@ -31,7 +27,7 @@ pub enum WeightsError {
     Tensor {
         /// Name of the tensor.
         name: String,
-        /// Shape that the run's configuration asks for.
+        /// The shape by the run's configuration.
         expected: Vec<usize>,
         /// What the file has.
         found: String,
@@ -46,22 +42,18 @@ pub enum WeightsError {
     },
 }
 
-/// The players as the bytes of a safetensors file, with `about` in its header.
+/// The networks of some players as the bytes of a safetensors file, with `about` in its header.
 ///
 /// # Errors
 /// If the format refuses a tensor.
-pub fn to_bytes<W: Arena>(pair: &Pair<W>, about: String) -> Result<Vec<u8>, WeightsError> {
+pub fn to_bytes(networks: &[(Role, &Network)], about: String) -> Result<Vec<u8>, WeightsError> {
     let mut tensors = BTreeMap::new();
-    let mut add = |role: Role, network: &Network| {
+    for &(role, network) in networks {
         for (name, tensor) in layout(role, network.shape()) {
             let bytes: Vec<u8> =
                 tensor.indices().flat_map(|at| network.parameters()[at].to_le_bytes()).collect();
             tensors.insert(name, (tensor.shape, bytes));
         }
-    };
-    add(Role::Protagonist, &pair.protagonist.network);
-    if let Some(antagonist) = &pair.antagonist {
-        add(Role::Antagonist, &antagonist.network);
     }
     let views = tensors
         .iter()
@@ -74,54 +66,50 @@ pub fn to_bytes<W: Arena>(pair: &Pair<W>, about: String) -> Result<Vec<u8>, Weig
     Ok(safetensors::serialize(views, Some(metadata))?)
 }
 
-/// Replaces the players' weights by those of a safetensors file.
-///
-/// # Errors
-/// If the bytes are no such file, or a tensor is absent or of another shape.
-pub fn load<W: Arena>(
-    pair: &mut Pair<W>,
-    bytes: &[u8],
-    device: Device,
-) -> Result<(), WeightsError> {
-    let file = SafeTensors::deserialize(bytes)?;
-    restore(&mut pair.protagonist, Role::Protagonist, &file, device)?;
-    if let Some(antagonist) = &mut pair.antagonist {
-        restore(antagonist, Role::Antagonist, &file, device)?;
+/// A safetensors file of weights.
+pub struct Weights<'a>(SafeTensors<'a>);
+
+impl<'a> Weights<'a> {
+    /// The file in these bytes.
+    ///
+    /// # Errors
+    /// If they are no safetensors file.
+    pub fn read(bytes: &'a [u8]) -> Result<Self, WeightsError> {
+        Ok(Weights(SafeTensors::deserialize(bytes)?))
     }
-    Ok(())
+
+    /// The network of a player.
+    ///
+    /// # Errors
+    /// If a tensor is absent or of another shape.
+    pub fn network(
+        &self,
+        role: Role,
+        shape: Shape,
+        device: Device,
+    ) -> Result<Network, WeightsError> {
+        let mut parameters = vec![0.0; shape.parameters()];
+        for (name, tensor) in layout(role, shape) {
+            let refuse = |found: String| WeightsError::Tensor {
+                name: name.clone(),
+                expected: tensor.shape.clone(),
+                found,
+            };
+            let view = self.0.tensor(&name).map_err(|_| refuse("none".to_owned()))?;
+            if view.dtype() != Dtype::F32 || view.shape() != tensor.shape {
+                return Err(refuse(format!("{:?} of {:?}", view.shape(), view.dtype())));
+            }
+            for (at, bytes) in tensor.indices().zip(view.data().as_chunks::<4>().0) {
+                parameters[at] = f32::from_le_bytes(*bytes);
+            }
+        }
+        let network = Network::from_parameters(shape, parameters, device);
+        let refused = |quantity| WeightsError::NotFinite { role, quantity };
+        network.not_finite().map_or(Ok(network), |quantity| Err(refused(quantity)))
+    }
 }
 
-fn restore<H: Head>(
-    player: &mut Player<H>,
-    role: Role,
-    file: &SafeTensors<'_>,
-    device: Device,
-) -> Result<(), WeightsError> {
-    let shape = player.network.shape();
-    let mut parameters = vec![0.0; shape.parameters()];
-    for (name, tensor) in layout(role, shape) {
-        let refuse = |found: String| WeightsError::Tensor {
-            name: name.clone(),
-            expected: tensor.shape.clone(),
-            found,
-        };
-        let view = file.tensor(&name).map_err(|_| refuse("none".to_owned()))?;
-        if view.dtype() != Dtype::F32 || view.shape() != tensor.shape {
-            return Err(refuse(format!("{:?} of {:?}", view.shape(), view.dtype())));
-        }
-        for (at, bytes) in tensor.indices().zip(view.data().as_chunks::<4>().0) {
-            parameters[at] = f32::from_le_bytes(*bytes);
-        }
-    }
-    *player = Player::with_network(
-        player.head.clone(),
-        Network::from_parameters(shape, parameters, device),
-    );
-    let refused = |quantity| WeightsError::NotFinite { role, quantity };
-    player.not_finite().map_or(Ok(()), |quantity| Err(refused(quantity)))
-}
-
-/// Where a tensor's entries lie in the flat parameters: entry (i, j) at
+/// Where a tensor's entries are in the flat parameters: entry (i, j) at
 /// `start + i * strides[0] + j * strides[1]`.
 struct Place {
     shape: Vec<usize>,
@@ -138,7 +126,7 @@ impl Place {
     }
 }
 
-/// All tensors of a player, out of the flat layout of [`crate::network`].
+/// All tensors of a player, out of the flat layout of [`crate::learn::network`].
 fn layout(role: Role, shape: Shape) -> Vec<(String, Place)> {
     let Shape { inputs, hidden, outputs, constants } = shape;
     let mut places = Vec::new();

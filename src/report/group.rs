@@ -2,8 +2,10 @@
 
 use super::runs::{Run, Runs};
 use super::statistics::{self, Estimate};
-use crate::experiment::artefacts::{Chance, Mode};
+use crate::experiment::archive::FIRST_METHOD;
+use crate::experiment::artefacts::Chance;
 use crate::game::returns::ReturnLaw;
+use crate::learn::policy::Mode;
 use lava_envs::End;
 use lava_envs::random::{self, ChaCha8Rng, Purpose};
 use rand_distr::{Distribution as _, StandardNormal};
@@ -63,7 +65,7 @@ impl Laws {
         let greedy = run.law(Mode::Greedy, Chance::Nominal).map(&mut take);
         let sampled = run.law(Mode::Sampled, Chance::Nominal).map(&mut take);
         // At eta = 1 the game is the nominal play: the same episodes, not others like them.
-        let (game, greedy_game) = if run.eta == 1.0 {
+        let (game, greedy_game) = if run.name.eta == 1.0 {
             (sampled.clone(), greedy.clone())
         } else {
             (run.game_law(Mode::Sampled).map(&mut take), run.game_law(Mode::Greedy).map(&mut take))
@@ -136,8 +138,11 @@ impl Measures {
     }
 }
 
-/// All seeds of one world and eta.
+/// All seeds of one world and eta, of one method and variant.
 pub struct Group<'a> {
+    /// What its rows and panels are called: `METHOD[/VARIANT]`, or only `VARIANT` in a folder where all runs are
+    /// of the method `game`; `None` where none has a variant either.
+    pub method: Option<String>,
     /// Name of the world.
     pub env: &'a str,
     /// Budget eta.
@@ -153,25 +158,34 @@ pub struct Group<'a> {
     replicates: Vec<Vec<Measures>>,
 }
 
-/// The runs, measured and bootstrapped, by world and eta.
+/// The runs, measured and bootstrapped, by method and variant, world and eta.
 pub fn groups(runs: &Runs) -> Vec<Group<'_>> {
-    let mut groups = Vec::new();
-    for world in runs.runs.chunk_by(|a, b| a.env == b.env) {
-        let mut alphas: Vec<f64> = ALPHAS.into_iter().chain(world.iter().map(Run::alpha)).collect();
+    let one_method = runs.runs.iter().all(|run| run.name.method == FIRST_METHOD);
+    let method = |run: &Run| match &run.name.variant {
+        _ if runs.are_plain() => None,
+        Some(variant) if one_method => Some(variant.clone()),
+        _ => Some(run.name.label()),
+    };
+    let same = |a: &Run, b: &Run| {
+        let (a, b) = (&a.name, &b.name);
+        (&a.method, &a.variant, &a.world, a.eta) == (&b.method, &b.variant, &b.world, b.eta)
+    };
+    let alphas = |of: &[Run]| {
+        let world = runs.runs.iter().filter(|run| run.name.world == of[0].name.world);
+        let mut alphas: Vec<f64> = ALPHAS.into_iter().chain(world.map(Run::alpha)).collect();
         alphas.sort_by(|a, b| b.total_cmp(a));
         alphas.dedup();
-        for runs in world.chunk_by(|a, b| a.eta == b.eta) {
-            groups.push(Group::new(runs, alphas.clone()));
-        }
-    }
-    groups
+        alphas
+    };
+    (runs.runs.chunk_by(same)).map(|of| Group::new(method(&of[0]), of, alphas(of))).collect()
 }
 
 impl<'a> Group<'a> {
-    fn new(runs: &'a [Run], alphas: Vec<f64>) -> Self {
-        let (env, eta) = (runs[0].env.as_str(), runs[0].eta);
+    fn new(method: Option<String>, runs: &'a [Run], alphas: Vec<f64>) -> Self {
+        let (env, eta) = (runs[0].name.world.as_str(), runs[0].name.eta);
         let measures: Vec<Measures> = runs.iter().map(|run| Measures::of(run, &alphas)).collect();
-        // The stream belongs to the group's name, so its intervals do not move when others come.
+        // The stream belongs to the world and eta: intervals do not move when other rows are added, and
+        // methods are redrawn alike.
         let index = fnv(&format!("{env}/eta-{eta}")) & ((1 << 56) - 1);
         let mut random = random::stream(0, Purpose::Bootstrap, index);
         let seeds: Vec<(&Run, &Measures)> = runs.iter().zip(&measures).collect();
@@ -181,7 +195,13 @@ impl<'a> Group<'a> {
             &mut random,
             |(run, found), random| Measures::redrawn(run, found, &alphas, random),
         );
-        Group { env, eta, runs, alphas, measures, replicates }
+        Group { method, env, eta, runs, alphas, measures, replicates }
+    }
+
+    /// The heading of its panels: `eta = 25`, after its method where there are several.
+    pub fn title(&self) -> String {
+        let method = self.method.as_ref().map_or(String::new(), |method| format!("{method}, "));
+        format!("{method}eta = {}", self.eta)
     }
 
     /// Number of runs that failed.
@@ -197,7 +217,7 @@ impl<'a> Group<'a> {
     /// The place of a level in [`Measures::cvar`].
     ///
     /// # Panics
-    /// If the level is none of [`Group::alphas`].
+    /// If the level is not one of [`Group::alphas`].
     pub fn level(&self, alpha: f64) -> usize {
         let place = self.alphas.iter().position(|&level| level == alpha);
         place.expect("every alpha of the world is measured")
@@ -243,16 +263,16 @@ impl<'a> Group<'a> {
         let scores = ranked(&self.measures, &measure)?;
         let worst = statistics::worst(&scores)?;
         let place = scores.iter().position(|&score| score == worst)?;
-        Some((self.runs[place].seed, worst))
+        Some((self.runs[place].name.seed, worst))
     }
 
     /// CVaR at this group's alpha minus the same of `baseline`, over the seeds that both have.
-    /// Answers with the number of these pairs too.
+    /// The number of these pairs comes with it.
     pub fn difference(&self, baseline: &Group) -> Option<(Estimate, usize)> {
         let (own, other) = (self.level(self.alpha()), baseline.level(self.alpha()));
         let differences: Vec<f64> = (self.runs.iter().zip(&self.measures))
             .filter_map(|(run, measures)| {
-                let twin = baseline.runs.iter().position(|twin| twin.seed == run.seed)?;
+                let twin = baseline.runs.iter().position(|twin| twin.name.seed == run.name.seed)?;
                 let score = measures.cvar[own]?;
                 Some(score - baseline.measures[twin].cvar[other]?)
             })
@@ -282,8 +302,8 @@ impl<'a> Group<'a> {
         let value = statistic(&self.measures)?;
         let replicates: Vec<f64> =
             self.replicates.iter().filter_map(|replicate| statistic(replicate)).collect();
-        // One seed tells nothing of the spread between seeds: its episodes alone would make an
-        // interval that looks like an answer.
+        // One seed says nothing about the spread between seeds: its episodes alone would make an
+        // interval that is far too narrow.
         let enough = self.measures.iter().filter(|measures| !measures.absent).count() > 1;
         let interval = statistics::percentile_interval(&replicates).filter(|_| enough);
         Some(Estimate { value, interval })

@@ -36,7 +36,8 @@ fn environment(table: &Table, world: &World, block: Block) -> String {
     }
     let headings = row_headings(table);
     let titles = headings.iter().copied().chain(columns.iter().map(|(_, column)| column.title));
-    let align: String = headings.iter().map(|&of| if of == "folder" { 'l' } else { 'r' }).collect();
+    let align: String =
+        headings.iter().map(|&of| if Some(of) == table.heading { 'l' } else { 'r' }).collect();
     let mut lines = vec![titles.map(escaped).collect::<Vec<String>>()];
     for row in &world.rows {
         let (count, failed) = render::seeds(row);
@@ -63,7 +64,7 @@ fn environment(table: &Table, world: &World, block: Block) -> String {
          \\resizebox{{\\ifdim\\width>\\linewidth\\linewidth\\else\\width\\fi}}{{!}}{{%\n  \
          \\begin{{tabular}}{{{align}{}}}\n    \\toprule\n{header}    \\midrule\n{}    \\bottomrule\n  \\end{{tabular}}}}\n\\end{{table}}\n",
         escaped(&world.name),
-        escaped(block.title()),
+        escaped(&block.title(table)),
         label(&world.name),
         label(&format!("{block:?}").to_lowercase()),
         "r".repeat(columns.len()),

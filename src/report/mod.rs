@@ -1,45 +1,82 @@
-//! Results: statistics and tables, from artefacts alone.
+//! Results: statistics, tables, figures and the page, only from the records of runs.
 //!
 //! [`write()`] reads every run below a results folder and leaves beside them
 //!
 //! | file | what | one row per |
 //! |---|---|---|
 //! | `runs.csv` | the numbers of the runs ([`runs`]) | run |
-//! | `table.csv`, `table.md`, `table.tex` | statistics over seeds with intervals ([`table`]) | world and eta |
-//! | `cross.csv` | greedy CVaR of every policy at every alpha ([`cross`]) | world, eta and alpha |
+//! | `table.csv`, `table.md`, `table.tex` | statistics over seeds with intervals ([`table`]) | method, world and eta |
+//! | `cross.csv` | greedy CVaR of every policy at every alpha ([`cross`]) | method, world, eta and alpha |
 //!
 //! [`write_all`] adds `figures/` ([`figures`]) and `report.html` ([`page`]), and [`write_comparison`] puts
-//! several folders side by side.
+//! several folders side by side. Methods and variants in one folder are compared in the same way.
 //!
-//! Nothing is simulated and nothing drawn except the bootstrap, whose streams are named: the same
-//! artefacts give the same bytes.
+//! Nothing is simulated, and the only random numbers are those of the bootstrap, whose streams are named:
+//! the same artefacts give the same bytes. What a world looks like, and its exact optima, are asked from
+//! [`Worlds`].
 
-pub mod archive;
 pub mod cross;
 pub mod figures;
 pub mod group;
 pub mod latex;
 pub mod page;
+pub mod records;
 pub mod render;
 pub mod runs;
 pub mod statistics;
 pub mod table;
 
+use crate::experiment::registry::Registry;
 use crate::files::write_in_place;
+use crate::game::returns::ReturnLaw;
 use figures::Figures;
-use group::groups;
+use group::Group;
 use latex::Latex;
+use lava_envs::scene::Scene;
 use render::{Csv, Json, Markdown, Render, Terminal};
 use runs::Runs;
 use std::path::{Path, PathBuf};
 use table::{Results, Table};
+
+/// What the report asks about worlds, which it knows only by their names.
+pub trait Worlds {
+    /// The place where episodes of the world with these constants happen; `None` if it is not known or
+    /// refuses the constants.
+    fn scene(&self, world: &str, constants: &toml::Table) -> Option<Scene>;
+
+    /// The laws of the return of the policies that are optimal at these budgets, without those that
+    /// cannot be computed; `None` if the world has no exact yardstick.
+    fn frontier(
+        &self,
+        world: &str,
+        constants: &toml::Table,
+        gamma: f64,
+        etas: &[f64],
+    ) -> Option<Vec<ReturnLaw>>;
+}
+
+impl Worlds for Registry {
+    fn scene(&self, world: &str, constants: &toml::Table) -> Option<Scene> {
+        self.named(world)?.scene(constants)
+    }
+
+    fn frontier(
+        &self,
+        world: &str,
+        constants: &toml::Table,
+        gamma: f64,
+        etas: &[f64],
+    ) -> Option<Vec<ReturnLaw>> {
+        self.named(world)?.frontier(constants, gamma, etas)
+    }
+}
 
 /// Why no report could be made. Every message names the file and says what to do.
 #[derive(Debug, thiserror::Error)]
 pub enum ReportError {
     /// The folder holds no run.
     #[error(
-        "no runs in {}: expected folders ENV/eta-E/seed-N with an evaluation.json; \
+        "no runs in {}: expected folders WORLD/METHOD/eta-E/seed-N with an evaluation.json, or a runs.zip; \
          give the folder that `bench` or `train` wrote to{}",
         .dir.display(), .notes.iter().map(|note| format!(" ({note})")).collect::<String>()
     )]
@@ -92,18 +129,18 @@ pub enum ReportError {
     },
 }
 
-/// Reads the runs below `dir`, writes `runs.csv`, `table.csv`, `table.md`, `table.tex` and `cross.csv`
-/// into it and answers with the table as text for a terminal (at most 140 columns wide).
+/// Reads the runs below `dir` and writes `runs.csv`, `table.csv`, `table.md`, `table.tex` and `cross.csv`
+/// into it. Returns the table as text for a terminal (at most 140 columns wide, beside long names).
 ///
 /// Each file is replaced in one step: a reader sees the old one or the new one, never a part.
 ///
 /// # Errors
-/// If `dir` holds no run, a file in it cannot be read or is not what it should be, or a result cannot
-/// be written. Nothing is written unless everything could be read.
+/// If `dir` holds no run or none of its runs can be read, or a result cannot be written.
 pub fn write(dir: &Path) -> Result<String, ReportError> {
     let runs = Runs::read(dir)?;
-    write_tables(dir, &Results { name: "", runs: &runs, groups: groups(&runs) })
-        .map(|(_, terminal)| terminal)
+    let name = names(&[dir]).remove(0);
+    let results = Results::of(&[(&name, &runs)]);
+    write_tables(dir, &runs, &results).map(|(_, terminal)| terminal)
 }
 
 /// What [`write_all`] has written.
@@ -120,33 +157,40 @@ pub struct Written {
 ///
 /// # Errors
 /// As [`write()`].
-pub fn write_all(dir: &Path) -> Result<Written, ReportError> {
+pub fn write_all(dir: &Path, worlds: &dyn Worlds) -> Result<Written, ReportError> {
     let runs = Runs::read(dir)?;
     let name = names(&[dir]).remove(0);
-    let results = Results { name: &name, runs: &runs, groups: groups(&runs) };
-    let figures = figures::draw(&results.groups)?;
-    let (table, terminal) = write_tables(dir, &results)?;
-    let page = page::render(&name, &table, &results.groups, &figures)?;
+    let results = Results::of(&[(&name, &runs)]);
+    let (panels, notes) = figures::panels(&results);
+    let figures = figures::draw(&panels, notes, worlds);
+    let (table, terminal) = write_tables(dir, &runs, &results)?;
+    let page = page::render(&name, &table, &panels, &figures, worlds);
     persist_figures(dir, &figures)?;
     persist(&dir.join("report.html"), page.as_bytes())?;
     Ok(Written { table: terminal, figures })
 }
 
-fn write_tables(dir: &Path, results: &Results) -> Result<(Table, String), ReportError> {
-    persist(&dir.join("runs.csv"), results.runs.to_csv().as_bytes())?;
-    persist(&dir.join("cross.csv"), cross::to_csv(&results.groups).as_bytes())?;
-    let table = Table::new(std::slice::from_ref(results));
+fn write_tables(
+    dir: &Path,
+    runs: &Runs,
+    results: &[Results],
+) -> Result<(Table, String), ReportError> {
+    persist(&dir.join("runs.csv"), runs.to_csv().as_bytes())?;
+    let groups: Vec<&Group> = results.iter().flat_map(|results| &results.groups).collect();
+    persist(&dir.join("cross.csv"), cross::to_csv(&groups).as_bytes())?;
+    let table = Table::new(results);
     let terminal = write_table(&table, &dir.join("table"))?;
     Ok((table, terminal))
 }
 
 /// Puts `dir` and `others` side by side, as `comparison.csv`, `comparison.md` and `comparison.tex` in
-/// `dir`, and answers with the table as text for a terminal. Differences are to `dir`.
+/// `dir`. Returns the table as text for a terminal. Differences are to `dir`, and if it has several methods
+/// to its first one.
 ///
 /// # Errors
 /// As [`write()`], of any of the folders.
 pub fn write_comparison(dir: &Path, others: &[PathBuf]) -> Result<String, ReportError> {
-    with_comparison(dir, others, |table| write_table(table, &dir.join("comparison")))
+    write_table(&comparison(dir, others)?, &dir.join("comparison"))
 }
 
 /// The table for programs: one object with `schema`, `columns`, `worlds` and `notes`. Writes nothing.
@@ -154,16 +198,19 @@ pub fn write_comparison(dir: &Path, others: &[PathBuf]) -> Result<String, Report
 /// # Errors
 /// As [`write()`].
 pub fn table_json(dir: &Path, others: &[PathBuf]) -> Result<serde_json::Value, ReportError> {
-    with_comparison(dir, others, |table| Ok(Json.value(table)))
+    Ok(Json.value(&comparison(dir, others)?))
 }
 
 /// Draws the figures of the runs below `dir` into `DIR/figures`, each as SVG and PNG.
 ///
 /// # Errors
 /// As [`write()`].
-pub fn write_figures(dir: &Path) -> Result<Figures, ReportError> {
+pub fn write_figures(dir: &Path, worlds: &dyn Worlds) -> Result<Figures, ReportError> {
     let runs = Runs::read(dir)?;
-    let figures = figures::draw(&groups(&runs))?;
+    let name = names(&[dir]).remove(0);
+    let results = Results::of(&[(&name, &runs)]);
+    let (panels, notes) = figures::panels(&results);
+    let figures = figures::draw(&panels, notes, worlds);
     persist_figures(dir, &figures)?;
     Ok(figures)
 }
@@ -175,9 +222,9 @@ fn persist_figures(dir: &Path, figures: &Figures) -> Result<(), ReportError> {
     for figure in &figures.drawn {
         // The name of a world may have a dot.
         let file = |ending| folder.join(format!("{}.{ending}", figure.name));
-        persist(&file("svg"), figure.svg.as_bytes())?;
+        persist(&file("svg"), figure.picture.svg.as_bytes())?;
         let path = file("png");
-        let png = figures::png(&figure.svg).map_err(|what| ReportError::Write {
+        let png = figures::png(&figure.picture.svg).map_err(|what| ReportError::Write {
             path: path.clone(),
             source: std::io::Error::other(what),
         })?;
@@ -186,19 +233,13 @@ fn persist_figures(dir: &Path, figures: &Figures) -> Result<(), ReportError> {
     Ok(())
 }
 
-fn with_comparison<T>(
-    dir: &Path,
-    others: &[PathBuf],
-    then: impl FnOnce(&Table) -> Result<T, ReportError>,
-) -> Result<T, ReportError> {
+fn comparison(dir: &Path, others: &[PathBuf]) -> Result<Table, ReportError> {
     let dirs: Vec<&Path> =
         std::iter::once(dir).chain(others.iter().map(PathBuf::as_path)).collect();
     let runs: Vec<Runs> = dirs.iter().map(|dir| Runs::read(dir)).collect::<Result<_, _>>()?;
     let names = names(&dirs);
-    let results: Vec<Results> = (runs.iter().zip(&names))
-        .map(|(runs, name)| Results { name, runs, groups: groups(runs) })
-        .collect();
-    then(&Table::new(&results))
+    let folders: Vec<(&str, &Runs)> = names.iter().map(String::as_str).zip(&runs).collect();
+    Ok(Table::new(&Results::of(&folders)))
 }
 
 /// Folders by their last part, or by the whole path where that is not enough.

@@ -26,8 +26,8 @@ const data = document.getElementById("episodes");
 if (data) {
   const { scenes, runs } = JSON.parse(data.textContent);
   const find = (id) => document.getElementById(id);
-  const [env, eta, seed, chance, episode, scrub, play] =
-    ["env", "eta", "seed", "chance", "episode", "scrub", "play"].map(find);
+  const [env, method, eta, seed, chance, episode, scrub, play] =
+    ["env", "method", "eta", "seed", "chance", "episode", "scrub", "play"].map(find);
   const canvas = find("scene");
   const context = canvas.getContext("2d");
   const state = { time: 0, timer: null, run: null, shown: null };
@@ -44,8 +44,10 @@ if (data) {
     pause();
     fill(env, distinct(runs.map((run) => run.env)).map((name) => [name, name]));
     const ofEnv = runs.filter((run) => run.env === env.value);
-    fill(eta, distinct(ofEnv.map((run) => run.eta)).map((value) => [value, value]));
-    const ofEta = ofEnv.filter((run) => String(run.eta) === eta.value);
+    fill(method, distinct(ofEnv.map((run) => run.method ?? "")).map((name) => [name, name]));
+    const ofMethod = ofEnv.filter((run) => (run.method ?? "") === method.value);
+    fill(eta, distinct(ofMethod.map((run) => run.eta)).map((value) => [value, value]));
+    const ofEta = ofMethod.filter((run) => String(run.eta) === eta.value);
     fill(seed, ofEta.map((run) => [run.seed, run.seed]));
     state.run = ofEta.find((run) => String(run.seed) === seed.value);
     fill(chance, distinct(state.run.stored.map((of) => of.chance)).map((kind) => [kind, names[kind]]));
@@ -71,17 +73,18 @@ if (data) {
       lines.push(`product so far ${number(product)}`);
     }
     if (time === actions.length) lines.push(`ended: ${end}, return ${value.toFixed(3)}`);
-    find("told").textContent = lines.join(" · ");
+    find("step").textContent = lines.join(" · ");
   };
 
   const draw = () => {
-    const scene = scenes[env.value];
+    const scene = scenes[state.run.scene];
     const style = getComputedStyle(document.documentElement);
     const ink = style.getPropertyValue("--ink");
     const unit = canvas.width / scene.size[0];
     canvas.height = Math.round(unit * scene.size[1]);
     // A cell's place is its corner, a body's its centre.
-    const at = ([x, y]) => [(x + scene.offset) * unit, (y + scene.offset) * unit];
+    const offset = scene.cells ? 0.5 : 0;
+    const at = ([x, y]) => [(x + offset) * unit, (y + offset) * unit];
     context.clearRect(0, 0, canvas.width, canvas.height);
     for (const { kind, min, max } of scene.areas) {
       context.fillStyle = { lava: "#d55e00", goal: "#009e73", wall: ink }[kind];
@@ -89,7 +92,7 @@ if (data) {
     }
     context.lineWidth = 2;
     context.strokeStyle = style.getPropertyValue("--line");
-    if (scene.offset > 0) {
+    if (scene.cells) {
       for (let x = 1; x < scene.size[0]; x++) line([x * unit, 0], [x * unit, canvas.height]);
       for (let y = 1; y < scene.size[1]; y++) line([0, y * unit], [canvas.width, y * unit]);
     }
@@ -121,7 +124,7 @@ if (data) {
   const arrow = (from, [dx, dy], colour, scene, at) => {
     const length = Math.hypot(dx, dy);
     if (length < 0.05) return;
-    const scale = scene.offset > 0 ? 0.6 : 0.8;
+    const scale = scene.cells ? 0.6 : 0.8;
     const tip = [from[0] + dx * scale, from[1] + dy * scale];
     context.strokeStyle = colour;
     context.lineWidth = 5;
@@ -148,7 +151,7 @@ if (data) {
     }, 250);
   };
 
-  for (const select of [env, eta, seed, chance, episode]) select.addEventListener("change", choose);
+  for (const select of [env, method, eta, seed, chance, episode]) select.addEventListener("change", choose);
   scrub.addEventListener("input", () => { pause(); show(Number(scrub.value)); });
   play.addEventListener("click", () => (state.timer === null ? start() : pause()));
   matchMedia("(prefers-color-scheme: dark)").addEventListener("change", draw);

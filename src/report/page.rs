@@ -2,32 +2,27 @@
 //!
 //! Summary first, then tables, figures, a player of stored episodes, and how each number was made.
 
-use super::figures::Figures;
-use super::group::Group;
+use super::Worlds;
+use super::figures::{Figures, Panel, Picture};
 use super::render::{columns, legend, row_headings, row_name, seeds, words};
 use super::table::{Block, Cell, Row, Table, World};
-use super::{ReportError, archive};
-use crate::experiment::config::WorldConfig;
-use crate::experiment::exhibits::StoredEpisode;
-use lava_envs::LavaGrid;
+use crate::experiment::figure_data::StoredEpisode;
+use lava_envs::scene::Scene;
 use maud::{DOCTYPE, Markup, PreEscaped, html};
 use serde::Serialize;
-use std::collections::BTreeMap;
 
-/// Seeds of one world and eta whose episodes the player has: the page stays small.
+/// Seeds of one world, method and eta whose episodes the player has: the page stays small.
 const PLAYED_SEEDS: usize = 5;
 
 /// The text of `report.html`.
-///
-/// # Errors
-/// If a file of a run is there and cannot be read.
 pub fn render(
     name: &str,
     table: &Table,
-    groups: &[Group],
+    panels: &[Panel],
     figures: &Figures,
-) -> Result<String, ReportError> {
-    let episodes = Episodes::read(groups)?;
+    worlds: &dyn Worlds,
+) -> String {
+    let episodes = Episodes::of(panels, worlds);
     let page = html! {
         (DOCTYPE)
         html lang="en" {
@@ -61,7 +56,7 @@ pub fn render(
             }
         }
     };
-    Ok(page.into_string())
+    page.into_string()
 }
 
 /// The main numbers of each row in a sentence, and what a reader must know before trusting them.
@@ -72,12 +67,12 @@ fn summary(table: &Table) -> Markup {
             "It should maximise CVaR at alpha = 1/eta: the mean of its worst returns." }
         @for world in &table.worlds {
             h3 { (world.name) }
-            ul { @for row in &world.rows { li { (sentence(row)) } } }
+            ul { @for row in &world.rows { li { (sentence(table, row)) } } }
         }
     }
 }
 
-fn sentence(row: &Row) -> String {
+fn sentence(table: &Table, row: &Row) -> String {
     let said = |key: &str| {
         let place = super::table::COLUMNS.iter().position(|column| column.key == key)?;
         let cell = row.cells[place];
@@ -88,7 +83,8 @@ fn sentence(row: &Row) -> String {
         })
     };
     let seeds = if row.seeds == 1 { "seed" } else { "seeds" };
-    let mut text = format!("eta = {} ({} {seeds})", row.eta, row.seeds);
+    let method = table.heading.map_or(String::new(), |_| format!("{}, ", row.name));
+    let mut text = format!("{method}eta = {} ({} {seeds})", row.eta, row.seeds);
     for (key, before, unit) in [
         ("mean", "mean return", ""),
         ("cvar", "CVaR at 1/eta", ""),
@@ -105,11 +101,11 @@ fn sentence(row: &Row) -> String {
 
 fn tables(table: &Table) -> Markup {
     html! {
-        p { "A click on a heading sorts. Green and bold: the best of its column, or not told apart from it." }
+        p { "A click on a heading sorts. Green and bold: the best of its column, or not distinguishable from it." }
         @for world in &table.worlds {
             @for block in Block::ALL {
                 @if !columns(world, block).is_empty() {
-                    h3 { (world.name) ": " (block.title()) }
+                    h3 { (world.name) ": " (block.title(table)) }
                     div.scroll tabindex="0" { (one_table(table, world, block)) }
                 }
             }
@@ -161,21 +157,20 @@ fn pictures(figures: &Figures) -> Markup {
         @for figure in &figures.drawn {
             figure id=(figure.name) {
                 h3 { (figure.title) }
-                div.scroll tabindex="0" role="img" aria-label=(figure.title) { (PreEscaped(scalable(&figure.svg))) }
+                div.scroll tabindex="0" role="img" aria-label=(figure.title) { (PreEscaped(scalable(&figure.picture))) }
                 figcaption { (figure.caption) }
             }
         }
         @if !figures.missing.is_empty() {
-            p.note { "Left out, for want of artefacts: " (figures.missing.join("; ")) "." }
+            p.note { "Left out, because the runs have no data for them: " (figures.missing.join("; ")) "." }
         }
+        @for note in &figures.notes { p.note { "Missing in the figures: " (note) } }
     }
 }
 
-/// Its size in pixels becomes the largest one: on a narrower page the viewBox keeps the shape.
-fn scalable(svg: &str) -> String {
-    let parts = svg.split_once("width=\"").zip(svg.split_once('>'));
-    let Some(((_, width), (head, rest))) = parts else { return svg.to_owned() };
-    let width = width.split('"').next().unwrap_or_default();
+/// Its width in pixels becomes the largest one: on a narrower page the viewBox keeps the shape.
+fn scalable(Picture { svg, width }: &Picture) -> String {
+    let Some((head, rest)) = svg.split_once('>') else { return svg.clone() };
     let kept = |word: &&str| !word.starts_with("width=") && !word.starts_with("height=");
     let head: Vec<&str> = head.split(' ').filter(kept).collect();
     let style = format!("max-width:{width}px;min-width:min({width}px,620px)");
@@ -189,19 +184,19 @@ fn player(episodes: &Episodes) -> Markup {
     let json = serde_json::to_string(episodes).expect("episodes are representable as JSON");
     html! {
         p { "The greedy protagonist's episodes, the first ones and the first that end in lava. Blue arrow: the "
-            "chosen action; rose arrow: what chance decided. In nominal episodes the likelihood ratios are those that the learned "
-            "antagonist would have given to what happened." }
+            "chosen action; rose arrow: the outcome of chance. In nominal episodes the likelihood ratios are those that the learned "
+            "antagonist would have given to these outcomes." }
         div id="player" {
             div.row {
-                @for (id, words) in [("env", "world"), ("eta", "eta"), ("seed", "seed"), ("chance", "under"), ("episode", "episode")] {
-                    label { (words) select id=(id) {} }
+                @for (id, words) in [("env", "world"), ("method", "method"), ("eta", "eta"), ("seed", "seed"), ("chance", "under"), ("episode", "episode")] {
+                    label hidden[id == "method" && episodes.runs.iter().all(|run| run.method.is_none())] { (words) select id=(id) {} }
                 }
             }
             div.row {
                 button id="play" type="button" { "Play" }
                 input id="scrub" type="range" min="0" step="1" value="0" aria-label="step";
             }
-            output id="told" aria-live="off" {}
+            output id="step" aria-live="off" {}
             canvas id="scene" width="1000" height="700" role="img" aria-label="the episode in its world" {}
         }
         // A tag or a comment inside the data would end the script, or keep it from ending.
@@ -211,7 +206,7 @@ fn player(episodes: &Episodes) -> Markup {
 
 fn made(table: &Table) -> Markup {
     html! {
-        p { "From the artefacts of the runs alone, by " code { "cvar-game report" } " " (env!("CARGO_PKG_VERSION")) "; nothing was simulated for this page." }
+        p { "Only from the records of the runs, by " code { "cvar-game report" } " " (env!("CARGO_PKG_VERSION")) "; nothing was simulated for this page." }
         dl { @for (term, meaning) in legend(table, "green and bold") { dt { (term) } dd { (meaning) } } }
     }
 }
@@ -219,87 +214,48 @@ fn made(table: &Table) -> Markup {
 /// What the player plays.
 #[derive(Serialize)]
 struct Episodes {
-    scenes: BTreeMap<String, Scene>,
+    scenes: Vec<Scene>,
     runs: Vec<Played>,
 }
 
 #[derive(Serialize)]
 struct Played {
     env: String,
+    method: Option<String>,
     eta: f64,
     seed: u64,
+    /// Place in `scenes`.
+    scene: usize,
     stored: Vec<StoredEpisode>,
 }
 
-/// A world's look: lengths in cells or metres.
-#[derive(Serialize)]
-struct Scene {
-    size: [f64; 2],
-    areas: Vec<Area>,
-    /// From a place to its middle: half a cell, or 0 for the centre of a body.
-    offset: f64,
-}
-
-#[derive(Serialize)]
-struct Area {
-    kind: &'static str,
-    min: [f64; 2],
-    max: [f64; 2],
-}
-
 impl Episodes {
-    fn read(groups: &[Group]) -> Result<Episodes, ReportError> {
-        let mut episodes = Episodes { scenes: BTreeMap::new(), runs: Vec::new() };
-        for group in groups {
-            let mut played = 0;
-            for run in group.runs {
-                let exhibits = archive::exhibits(run)?;
-                let Some(exhibits) =
-                    exhibits.filter(|of| played < PLAYED_SEEDS && !of.stored.is_empty())
-                else {
-                    continue;
-                };
-                let world = archive::world(&run.folder.join("config.toml"))?;
-                let Some(scene) = world.and_then(|(world, _)| Scene::of(&world)) else { continue };
-                episodes.scenes.entry(run.env.clone()).or_insert(scene);
-                let (env, stored) = (run.env.clone(), exhibits.stored);
-                episodes.runs.push(Played { env, eta: run.eta, seed: run.seed, stored });
-                played += 1;
-            }
+    fn of(panels: &[Panel], worlds: &dyn Worlds) -> Episodes {
+        let mut episodes = Episodes { scenes: Vec::new(), runs: Vec::new() };
+        for panel in panels {
+            let constants = panel.constants();
+            let Some(scene) = constants.and_then(|of| worlds.scene(panel.group.env, &of.world))
+            else {
+                continue;
+            };
+            let stored = panel.seeds.iter().filter_map(|(run, records)| {
+                let data = records.figure_data.as_ref().filter(|of| !of.stored.is_empty())?;
+                Some((run, &data.stored))
+            });
+            let place = episodes.scenes.iter().position(|of| *of == scene);
+            let place = place.unwrap_or_else(|| {
+                episodes.scenes.push(scene);
+                episodes.scenes.len() - 1
+            });
+            episodes.runs.extend(stored.take(PLAYED_SEEDS).map(|(run, stored)| Played {
+                env: run.name.world.clone(),
+                method: panel.group.method.clone(),
+                eta: run.name.eta,
+                seed: run.name.seed,
+                scene: place,
+                stored: stored.clone(),
+            }));
         }
-        Ok(episodes)
-    }
-}
-
-impl Scene {
-    fn of(world: &WorldConfig) -> Option<Scene> {
-        match world {
-            WorldConfig::LavaGrid(config) => {
-                let grid = LavaGrid::new(config, 1).ok()?;
-                let kind = |cell| match () {
-                    () if grid.is_lava(cell) => Some("lava"),
-                    () if grid.is_goal(cell) => Some("goal"),
-                    () if grid.is_wall(cell) => Some("wall"),
-                    () => None,
-                };
-                let area = |cell| {
-                    let (x, y) = grid.coordinates(cell);
-                    let min = [x as f64, y as f64];
-                    Some(Area { kind: kind(cell)?, min, max: min.map(|side| side + 1.0) })
-                };
-                Some(Scene {
-                    size: [grid.width() as f64, grid.height() as f64],
-                    areas: (0..grid.cells()).filter_map(area).collect(),
-                    offset: 0.5,
-                })
-            }
-            WorldConfig::LavaPoint(config) => Some(Scene {
-                size: config.arena,
-                areas: [("lava", config.lava), ("goal", config.goal)]
-                    .map(|(kind, area)| Area { kind, min: area.min, max: area.max })
-                    .into(),
-                offset: 0.0,
-            }),
-        }
+        episodes
     }
 }

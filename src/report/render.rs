@@ -40,13 +40,13 @@ pub(super) fn columns(world: &World, block: Block) -> Vec<(usize, &'static Colum
 
 /// Headings of what stands before the columns: which row it is.
 pub(super) fn row_headings(table: &Table) -> Vec<&'static str> {
-    if table.compares { vec!["eta", "folder", "seeds"] } else { vec!["eta", "seeds"] }
+    std::iter::once("eta").chain(table.heading).chain(["seeds"]).collect()
 }
 
-/// The cells below [`row_headings`], but for the seeds, which [`seeds`] tells.
+/// The cells below [`row_headings`], except the seeds, which [`seeds`] gives.
 pub(super) fn row_name(table: &Table, row: &Row) -> Vec<String> {
-    let folder = table.compares.then(|| row.folder.clone());
-    std::iter::once(row.eta.to_string()).chain(folder).collect()
+    let name = table.heading.map(|_| row.name.clone());
+    std::iter::once(row.eta.to_string()).chain(name).collect()
 }
 
 /// How the numbers came about, as terms and their meaning: columns shown, intervals, episodes, checks.
@@ -76,7 +76,7 @@ pub fn legend(table: &Table, mark: &str) -> Vec<(String, String)> {
     legend
 }
 
-/// A cell in words: its value and what stands below or behind it.
+/// A cell in words: its value and what stands below or after it.
 pub(super) fn words(format: Format, cell: Cell) -> (String, Option<String>) {
     let (decimals, factor) = match format {
         Format::Count => (0, 1.0),
@@ -113,7 +113,7 @@ pub(super) fn seeds(row: &Row) -> (String, Option<String>) {
     (row.seeds.to_string(), failed)
 }
 
-/// For a terminal, at most 140 columns wide: values above their intervals.
+/// For a terminal, at most 140 columns wide (and wider only for long names): values above their intervals.
 pub struct Terminal;
 
 impl Render for Terminal {
@@ -122,7 +122,7 @@ impl Render for Terminal {
         for world in &table.worlds {
             // The others are for reading at leisure.
             for block in [Block::Returns, Block::Game, Block::Comparison] {
-                let title = block.title();
+                let title = block.title(table);
                 let columns = columns(world, block);
                 if columns.is_empty() {
                     continue;
@@ -191,7 +191,7 @@ impl Render for Markdown {
         for world in &table.worlds {
             text += &format!("\n## {}\n", world.name);
             for block in Block::ALL {
-                let title = block.title();
+                let title = block.title(table);
                 let columns = columns(world, block);
                 if columns.is_empty() {
                     continue;
@@ -202,9 +202,9 @@ impl Render for Markdown {
                 ];
                 for row in &world.rows {
                     let cells = columns.iter().map(|&(place, column)| {
-                        let (value, behind) = words(column.format, row.cells[place]);
+                        let (value, after) = words(column.format, row.cells[place]);
                         let value = if row.best[place] { format!("**{value}**") } else { value };
-                        behind.map_or(value.clone(), |behind| format!("{value} {behind}"))
+                        after.map_or(value.clone(), |after| format!("{value} {after}"))
                     });
                     let (count, failed) = seeds(row);
                     let count =
@@ -252,16 +252,16 @@ fn escaped(text: &str) -> String {
     line.replace('<', "&lt;").replace('*', "\\*").replace('`', "\\`")
 }
 
-/// CSV: `env,eta,alpha,seeds,failures` (behind `folder`, if there are several), then every column by its key; an estimate has `KEY`, `KEY_lo`
-/// and `KEY_hi`, the worst seed `KEY` and `KEY_seed`. Rates are fractions. Six decimals; empty where
-/// there is no number.
+/// CSV: `env,eta,alpha,seeds,failures` (after `folder` or `method`, if there are several), then every
+/// column by its key; an estimate has `KEY`, `KEY_lo` and `KEY_hi`, the worst seed `KEY` and `KEY_seed`.
+/// Rates are fractions. Six decimals; empty where there is no number.
 pub struct Csv;
 
 impl Render for Csv {
     fn render(&self, table: &Table) -> String {
         let mut header = ["env", "eta", "alpha", "seeds", "failures"].map(str::to_owned).to_vec();
-        if table.compares {
-            header.insert(0, "folder".to_owned());
+        if let Some(heading) = table.heading {
+            header.insert(0, heading.to_owned());
         }
         for Column { key, format, .. } in &COLUMNS {
             header.push((*key).to_owned());
@@ -282,8 +282,8 @@ impl Render for Csv {
                     row.seeds.to_string(),
                     row.failures.to_string(),
                 ];
-                if table.compares {
-                    fields.insert(0, row.folder.clone());
+                if table.heading.is_some() {
+                    fields.insert(0, row.name.clone());
                 }
                 for (column, &cell) in COLUMNS.iter().zip(&row.cells) {
                     let width = match column.format {
@@ -314,8 +314,8 @@ impl Render for Csv {
 }
 
 /// JSON: `{schema, columns: {KEY: {title, meaning}}, worlds: [{env, episodes, checks, rows: [{folder,
-/// eta, alpha, seeds, failures, KEY: ..}]}], notes}`. An estimate is `{value, low, high}`, the worst seed `{value,
-/// seed}`, a count a number; `null` where there is no number.
+/// method, variant, eta, alpha, seeds, failures, KEY: ..}]}], notes}`. An estimate is `{value, low, high}`,
+/// the worst seed `{value, seed}`, a count a number; `null` where there is no number or no variant.
 pub struct Json;
 
 impl Json {
@@ -335,6 +335,8 @@ impl Json {
         let row = |row: &Row| {
             let mut value = json!({
                 "folder": row.folder,
+                "method": row.method,
+                "variant": row.variant,
                 "eta": row.eta,
                 "alpha": 1.0 / row.eta,
                 "seeds": row.seeds,

@@ -1,9 +1,10 @@
 //! Every run below a results folder, and `runs.csv`.
 //!
-//! A run is a folder `DIR/ENV/eta-E/seed-N` ([`crate::experiment::artefacts`]). With an
-//! `evaluation.json` it is finished; without one it has failed if its `manifest.json` says so, and is
-//! in progress otherwise: skipped, and mentioned. A failed run stays a row, so that nobody loses it
-//! from sight.
+//! A run is a folder `WORLD/METHOD[/VARIANT]/eta-E/seed-N` below the results folder, or a part of its
+//! archive ([`crate::experiment::archive`]); `WORLD/eta-E/seed-N` is one of the method `game`. With an
+//! `evaluation.json` it is finished; without one it has failed if its `manifest.json` says so, and is in
+//! progress otherwise: left out, with a note. A failed run stays a row, so that failures show.
+//! A run with a damaged file is left out, too, and the note names the file.
 //!
 //! Results of other programs enter the same tables without a `manifest.json`: with an
 //! `evaluation.json`, or simply with an `episodes.csv`, which has a line per episode and these columns
@@ -18,13 +19,14 @@
 //! | `chance` | who decided the outcomes: `nominal`, `antagonist` (the learned one) or `exact` (the worst case); may be left out: `nominal` |
 //! | `clearance` | least distance to lava in the episode; may be left out |
 //!
-//! `runs.csv`, ordered by world, eta and seed; alpha = 1/eta; numbers with six decimals; an empty
+//! `runs.csv`, ordered by method, variant, world, eta and seed; alpha = 1/eta; numbers with six decimals; an empty
 //! field is a number that does not exist (say, a certificate where the world has no yardstick) or a
 //! CVaR whose tail holds fewer than ten recorded episodes:
 //!
 //! | column | meaning |
 //! |---|---|
 //! | `env`, `eta`, `seed` | which run |
+//! | `method`, `variant` | after `env`, where there are other runs than those of the method `game` without a variant |
 //! | `status` | `finished` or `failed` |
 //! | `steps`, `seconds` | environment steps and wall-clock seconds of training |
 //! | `greedy_mean`, `greedy_cvar` | mean and CVaR_alpha of the return J, greedy protagonist, nominal chance |
@@ -43,24 +45,22 @@
 //! | `budget_violations` | steps or trajectories beyond tolerance, 0 |
 
 use super::{ReportError, statistics};
-use crate::experiment::artefacts::{Chance, Evaluation, Manifest, Mode, Play, SCHEMA};
-use crate::files::{LARGEST_FILE, read_at_most};
+use crate::experiment::archive::{FIRST_METHOD, RunFiles, RunName, Store};
+use crate::experiment::artefacts::{
+    Audit, Certificate, Chance, Evaluation, Manifest, Play, SCHEMA,
+};
 use crate::game::returns::{Atom, ReturnLaw};
+use crate::learn::policy::Mode;
 use lava_envs::End;
 use serde::Deserialize;
 use serde::de::DeserializeOwned;
-use std::collections::BTreeMap;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
-/// A run that came to an end.
+/// A run that has ended.
 #[derive(Debug, Clone)]
 pub struct Run {
-    /// Name of the world.
-    pub env: String,
-    /// Budget eta.
-    pub eta: f64,
-    /// Seed.
-    pub seed: u64,
+    /// World, method, variant, eta and seed.
+    pub name: RunName,
     /// Why it failed, if it did.
     pub failure: Option<String>,
     /// Environment steps of training.
@@ -69,14 +69,14 @@ pub struct Run {
     pub seconds: f64,
     /// What the evaluation found; a failed run may have none.
     pub evaluation: Option<Evaluation>,
-    /// Where all that lies.
-    pub folder: PathBuf,
+    /// Its files.
+    pub files: RunFiles,
 }
 
 impl Run {
     /// Risk level alpha = 1/eta.
     pub fn alpha(&self) -> f64 {
-        1.0 / self.eta
+        1.0 / self.name.eta
     }
 
     /// The return's law of this kind of play, the exact one if there are several.
@@ -91,7 +91,7 @@ impl Run {
 
     /// Under its antagonist; at eta = 1, where the antagonist has no power, the nominal law.
     pub fn game_law(&self, protagonist: Mode) -> Option<&ReturnLaw> {
-        let nominal = || self.law(protagonist, Chance::Nominal).filter(|_| self.eta == 1.0);
+        let nominal = || self.law(protagonist, Chance::Nominal).filter(|_| self.name.eta == 1.0);
         self.law(protagonist, Chance::Antagonist).or_else(nominal)
     }
 
@@ -104,135 +104,151 @@ impl Run {
         let plays = self.evaluation.iter().flat_map(|evaluation| &evaluation.plays);
         plays.filter(move |play| play.protagonist == protagonist && play.chance == chance)
     }
+}
 
-    /// `ENV/eta-E/seed-N`.
-    pub fn name(&self) -> String {
-        format!("{}/eta-{}/seed-{}", self.env, self.eta, self.seed)
+/// What the columns of `runs.csv` are computed from.
+struct Facts<'a> {
+    run: &'a Run,
+    greedy: Option<&'a ReturnLaw>,
+    sampled: Option<&'a ReturnLaw>,
+    game: Option<&'a ReturnLaw>,
+    certificate: Option<Certificate>,
+    audit: Option<Audit>,
+}
+
+impl<'a> Facts<'a> {
+    fn of(run: &'a Run) -> Self {
+        Facts {
+            run,
+            greedy: run.law(Mode::Greedy, Chance::Nominal),
+            sampled: run.law(Mode::Sampled, Chance::Nominal),
+            game: run.game_law(Mode::Sampled),
+            certificate: run.evaluation.as_ref().and_then(|evaluation| evaluation.certificate),
+            audit: run.evaluation.as_ref().and_then(|evaluation| evaluation.audit),
+        }
     }
 
-    /// The row of `runs.csv`, field by field in the order of [`COLUMNS`].
-    fn row(&self) -> Vec<String> {
-        let alpha = self.alpha();
-        let greedy = self.law(Mode::Greedy, Chance::Nominal);
-        let sampled = self.law(Mode::Sampled, Chance::Nominal);
-        let game = self.game_law(Mode::Sampled);
-        let cvar =
-            |law: Option<&ReturnLaw>, alpha| law.and_then(|law| statistics::cvar(law, alpha));
-        let end = |law: Option<&ReturnLaw>, end| law.map(|law| law.probability(end));
-        let mean = |law: Option<&ReturnLaw>| law.map(ReturnLaw::mean);
-        let sampled_cvar = cvar(sampled, alpha);
-        let certificate = self.evaluation.as_ref().and_then(|evaluation| evaluation.certificate);
-        let audit = self.evaluation.as_ref().and_then(|evaluation| evaluation.audit);
-        let count = |count: Option<u64>| count.map(|count| count.to_string()).unwrap_or_default();
-        vec![
-            self.env.clone(),
-            self.eta.to_string(),
-            self.seed.to_string(),
-            if self.failure.is_some() { "failed" } else { "finished" }.to_owned(),
-            self.steps.to_string(),
-            number(Some(self.seconds)),
-            number(mean(greedy)),
-            number(cvar(greedy, alpha)),
-            number(end(greedy, End::Lava)),
-            number(end(greedy, End::Goal)),
-            number(end(greedy, End::Timeout)),
-            number(cvar(greedy, 0.04)),
-            number(cvar(greedy, 0.01)),
-            number(greedy.filter(|_| cvar(greedy, alpha).is_some()).map(|law| law.var(alpha))),
-            number(greedy.and_then(ReturnLaw::steps_to_goal)),
-            number(self.clearance()),
-            number(mean(sampled)),
-            number(sampled_cvar),
-            number(end(sampled, End::Lava)),
-            number(cvar(sampled, 0.04)),
-            number(cvar(sampled, 0.01)),
-            number(mean(game)),
-            number(game.map(ReturnLaw::mean_standard_error)),
-            number(mean(self.game_law(Mode::Greedy))),
-            number(mean(game).zip(sampled_cvar).map(|(value, cvar)| value - cvar)),
-            number(certificate.map(|certificate| certificate.regret)),
-            number(certificate.map(|certificate| certificate.regret_standard_error)),
-            number(certificate.map(|certificate| certificate.antagonist_gap)),
-            number(certificate.map(|certificate| certificate.antagonist_gap_standard_error)),
-            number(audit.map(|audit| audit.max_budget_use)),
-            count(audit.map(|audit| audit.violations)),
-        ]
+    /// CVaR at the run's own level.
+    fn own_cvar(&self, law: Option<&ReturnLaw>) -> Option<f64> {
+        cvar(law, self.run.alpha())
     }
 }
 
-/// The columns of `runs.csv`.
-pub const COLUMNS: [&str; 31] = [
-    "env",
-    "eta",
-    "seed",
-    "status",
-    "steps",
-    "seconds",
-    "greedy_mean",
-    "greedy_cvar",
-    "greedy_lava",
-    "greedy_goal",
-    "greedy_timeout",
-    "greedy_cvar_0.04",
-    "greedy_cvar_0.01",
-    "greedy_var",
-    "greedy_steps_to_goal",
-    "greedy_clearance",
-    "sampled_mean",
-    "sampled_cvar",
-    "sampled_lava",
-    "sampled_cvar_0.04",
-    "sampled_cvar_0.01",
-    "game_value",
-    "game_value_se",
-    "greedy_game_value",
-    "bound_slack",
-    "regret",
-    "regret_se",
-    "antagonist_gap",
-    "antagonist_gap_se",
-    "budget_use",
-    "budget_violations",
+fn mean(law: Option<&ReturnLaw>) -> Field {
+    Field::Number(law.map(ReturnLaw::mean))
+}
+
+fn cvar(law: Option<&ReturnLaw>, alpha: f64) -> Option<f64> {
+    law.and_then(|law| statistics::cvar(law, alpha))
+}
+
+fn share(law: Option<&ReturnLaw>, end: End) -> Field {
+    Field::Number(law.map(|law| law.probability(end)))
+}
+
+/// A field of `runs.csv`.
+enum Field {
+    Text(String),
+    Count(Option<u64>),
+    Number(Option<f64>),
+}
+
+impl Field {
+    fn text(self) -> String {
+        match self {
+            Field::Text(text) => text,
+            Field::Count(count) => count.map(|count| count.to_string()).unwrap_or_default(),
+            Field::Number(value) => number(value),
+        }
+    }
+}
+
+/// A column of `runs.csv`: its name, and how a run fills it.
+type Column = (&'static str, fn(&Facts) -> Field);
+
+/// The columns that say of which method a run is; left out where all runs are plain ones of `game`.
+const METHOD_COLUMNS: [Column; 2] = [
+    ("method", |of| Field::Text(of.run.name.method.clone())),
+    ("variant", |of| Field::Text(of.run.name.variant.clone().unwrap_or_default())),
+];
+
+/// The other columns, in order.
+const COLUMNS: [Column; 31] = [
+    ("env", |of| Field::Text(of.run.name.world.clone())),
+    ("eta", |of| Field::Text(of.run.name.eta.to_string())),
+    ("seed", |of| Field::Count(Some(of.run.name.seed))),
+    ("status", |of| {
+        Field::Text(if of.run.failure.is_some() { "failed" } else { "finished" }.to_owned())
+    }),
+    ("steps", |of| Field::Count(Some(of.run.steps))),
+    ("seconds", |of| Field::Number(Some(of.run.seconds))),
+    ("greedy_mean", |of| mean(of.greedy)),
+    ("greedy_cvar", |of| Field::Number(of.own_cvar(of.greedy))),
+    ("greedy_lava", |of| share(of.greedy, End::Lava)),
+    ("greedy_goal", |of| share(of.greedy, End::Goal)),
+    ("greedy_timeout", |of| share(of.greedy, End::Timeout)),
+    ("greedy_cvar_0.04", |of| Field::Number(cvar(of.greedy, 0.04))),
+    ("greedy_cvar_0.01", |of| Field::Number(cvar(of.greedy, 0.01))),
+    ("greedy_var", |of| {
+        // Where the tail is too thin for a CVaR, it is for a quantile, too.
+        let greedy = of.greedy.filter(|_| of.own_cvar(of.greedy).is_some());
+        Field::Number(greedy.map(|law| law.var(of.run.alpha())))
+    }),
+    ("greedy_steps_to_goal", |of| Field::Number(of.greedy.and_then(ReturnLaw::steps_to_goal))),
+    ("greedy_clearance", |of| Field::Number(of.run.clearance())),
+    ("sampled_mean", |of| mean(of.sampled)),
+    ("sampled_cvar", |of| Field::Number(of.own_cvar(of.sampled))),
+    ("sampled_lava", |of| share(of.sampled, End::Lava)),
+    ("sampled_cvar_0.04", |of| Field::Number(cvar(of.sampled, 0.04))),
+    ("sampled_cvar_0.01", |of| Field::Number(cvar(of.sampled, 0.01))),
+    ("game_value", |of| mean(of.game)),
+    ("game_value_se", |of| Field::Number(of.game.map(ReturnLaw::mean_standard_error))),
+    ("greedy_game_value", |of| mean(of.run.game_law(Mode::Greedy))),
+    ("bound_slack", |of| {
+        let (value, cvar) = (of.game.map(ReturnLaw::mean), of.own_cvar(of.sampled));
+        Field::Number(value.zip(cvar).map(|(value, cvar)| value - cvar))
+    }),
+    ("regret", |of| Field::Number(of.certificate.map(|of| of.regret))),
+    ("regret_se", |of| Field::Number(of.certificate.map(|of| of.regret_standard_error))),
+    ("antagonist_gap", |of| Field::Number(of.certificate.map(|of| of.antagonist_gap))),
+    ("antagonist_gap_se", |of| {
+        Field::Number(of.certificate.map(|of| of.antagonist_gap_standard_error))
+    }),
+    ("budget_use", |of| Field::Number(of.audit.map(|of| of.max_budget_use))),
+    ("budget_violations", |of| Field::Count(of.audit.map(|of| of.violations))),
 ];
 
 /// All runs of a results folder.
 #[derive(Debug, Clone)]
 pub struct Runs {
-    /// Finished and failed runs, by world, eta and seed. Never empty.
+    /// Finished and failed runs, by method and variant (plain runs of the method `game` first), world, eta
+    /// and seed. Never empty.
     pub runs: Vec<Run>,
     /// What was found and left out.
     pub notes: Vec<String>,
 }
 
 impl Runs {
-    /// Reads `DIR/ENV/eta-E/seed-N` for all worlds, budgets and seeds.
+    /// Reads the runs of a results folder, from their folders and from its archive. A run with a file
+    /// that cannot be read, or is not what it should be, is left out, and a note names the file.
     ///
     /// # Errors
-    /// If there is no run, or a file cannot be read or is not what it should be.
+    /// If there is no run, none can be read, or the folder or its archive cannot be read.
     pub fn read(dir: &Path) -> Result<Runs, ReportError> {
-        let mut runs = Vec::new();
-        let mut notes = Vec::new();
+        let unreadable = |path, source| ReportError::Read { path, source };
+        let store = Store::open(dir).map_err(|error| unreadable(Store::archive(dir), error))?;
+        let found = store.list().map_err(|(path, source)| unreadable(path, source))?;
+        let (mut runs, mut notes) = (Vec::new(), found.notes);
         let mut in_progress = Vec::new();
-        for (env, world) in folders(dir)? {
-            for (eta_name, budget) in folders(&world)? {
-                let Some(eta) = eta_name.strip_prefix("eta-") else { continue };
-                let Some(eta) = eta.parse().ok().filter(|eta: &f64| *eta >= 1.0 && eta.is_finite())
-                else {
-                    notes.push(format!("{env}/{eta_name} left out: its name has no eta >= 1"));
-                    continue;
-                };
-                for (seed_name, folder) in folders(&budget)? {
-                    let Some(seed) = seed_name.strip_prefix("seed-") else { continue };
-                    let Ok(seed) = seed.parse() else {
-                        notes.push(format!(
-                            "{env}/{eta_name}/{seed_name} left out: its name has no seed"
-                        ));
-                        continue;
-                    };
-                    match read_run(&folder, &env, eta, seed)? {
-                        Some(run) => runs.push(run),
-                        None => in_progress.push(format!("{env}/{eta_name}/{seed_name}")),
-                    }
+        let mut damaged = None;
+        for files in found.runs {
+            let path = files.path.clone();
+            match read_run(files) {
+                Ok(Some(run)) => runs.push(run),
+                Ok(None) => in_progress.push(path),
+                Err(error) => {
+                    notes.push(format!("LEFT OUT: {path}. {error}."));
+                    damaged.get_or_insert(error);
                 }
             }
         }
@@ -240,25 +256,47 @@ impl Runs {
             notes.push(format!("Still in progress and left out: {}.", in_progress.join(", ")));
         }
         if runs.is_empty() {
-            return Err(ReportError::NoRuns { dir: dir.to_path_buf(), notes });
+            let none = || ReportError::NoRuns { dir: dir.to_path_buf(), notes };
+            return Err(damaged.unwrap_or_else(none));
         }
+        let place = |run: &Run| {
+            let of = &run.name;
+            let method = (of.method != FIRST_METHOD, of.method.clone(), of.variant.clone());
+            (method, of.world.clone())
+        };
         runs.sort_by(|a, b| {
-            a.env.cmp(&b.env).then(a.eta.total_cmp(&b.eta)).then(a.seed.cmp(&b.seed))
+            let (a_name, b_name) = (&a.name, &b.name);
+            (place(a).cmp(&place(b)))
+                .then(a_name.eta.total_cmp(&b_name.eta))
+                .then(a_name.seed.cmp(&b_name.seed))
         });
         // `eta-25` and `eta-25.0` are two folders and one experiment.
-        if let Some(pair) = runs.windows(2).find(|pair| pair[0].name() == pair[1].name()) {
+        if let Some(pair) = runs.windows(2).find(|pair| pair[0].name == pair[1].name) {
             return Err(ReportError::Corrupt {
-                path: dir.join(&pair[0].env),
-                what: format!("two folders hold {}", pair[0].name()),
+                path: dir.join(&pair[0].name.world),
+                what: format!("two folders hold {}", pair[0].name),
             });
         }
         Ok(Runs { runs, notes })
     }
 
+    /// Whether all are of the method `game` without a variant, so that rows need not name it.
+    pub fn are_plain(&self) -> bool {
+        self.runs.iter().all(|run| run.name.is_plain())
+    }
+
     /// The text of `runs.csv`.
     pub fn to_csv(&self) -> String {
-        let header = COLUMNS.map(str::to_owned).to_vec();
-        csv_text(std::iter::once(header).chain(self.runs.iter().map(Run::row)))
+        let mut columns = COLUMNS.to_vec();
+        if !self.are_plain() {
+            columns.splice(1..1, METHOD_COLUMNS);
+        }
+        let header = columns.iter().map(|(name, _)| (*name).to_owned()).collect();
+        let row = |run| {
+            let facts = Facts::of(run);
+            columns.iter().map(|(_, get)| get(&facts).text()).collect()
+        };
+        csv_text(std::iter::once(header).chain(self.runs.iter().map(row)))
     }
 }
 
@@ -279,32 +317,17 @@ pub(super) fn csv_text(rows: impl IntoIterator<Item = Vec<String>>) -> String {
     String::from_utf8(bytes).expect("fields are text")
 }
 
-/// Names and paths of the visible folders in `dir`, by name.
-fn folders(dir: &Path) -> Result<BTreeMap<String, PathBuf>, ReportError> {
-    let failed = |source| ReportError::Read { path: dir.to_path_buf(), source };
-    let mut folders = BTreeMap::new();
-    for entry in std::fs::read_dir(dir).map_err(failed)? {
-        let path = entry.map_err(failed)?.path();
-        let name = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
-        if path.is_dir() && !name.starts_with('.') {
-            folders.insert(name, path);
-        }
-    }
-    Ok(folders)
-}
-
-/// The run in a folder; `None` while it is in progress.
-fn read_run(folder: &Path, env: &str, eta: f64, seed: u64) -> Result<Option<Run>, ReportError> {
-    let manifest: Option<Manifest> = read_json(&folder.join("manifest.json"))?;
-    let mut path = folder.join("evaluation.json");
-    let mut evaluation: Option<Evaluation> = read_json(&path)?;
+/// The run of these files; `None` while it is in progress.
+fn read_run(files: RunFiles) -> Result<Option<Run>, ReportError> {
+    let manifest: Option<Manifest> = read_json(&files, "manifest.json")?;
+    let mut file = "evaluation.json";
+    let mut evaluation: Option<Evaluation> = read_json(&files, file)?;
     if evaluation.is_none() {
-        path = folder.join("episodes.csv");
-        evaluation = read_episodes(&path, env, eta, seed)?;
+        file = "episodes.csv";
+        evaluation = read_episodes(&files, file)?;
     }
     if let Some(evaluation) = &evaluation {
-        check(evaluation, env, eta, seed)
-            .map_err(|what| ReportError::Corrupt { path: path.clone(), what })?;
+        check(evaluation, &files.name).map_err(|what| corrupt(&files, file, what))?;
     }
     let failure = manifest.as_ref().and_then(|manifest| manifest.failure.clone());
     if evaluation.is_none() && failure.is_none() {
@@ -313,25 +336,32 @@ fn read_run(folder: &Path, env: &str, eta: f64, seed: u64) -> Result<Option<Run>
     let trained = (evaluation.as_ref().map(|of| (of.steps, of.seconds)))
         .or(manifest.map(|of| (of.steps, of.seconds)));
     let (steps, seconds) = trained.unwrap_or_default();
-    let (env, folder) = (env.to_owned(), folder.to_owned());
-    Ok(Some(Run { env, eta, seed, failure, steps, seconds, evaluation, folder }))
+    Ok(Some(Run { name: files.name.clone(), failure, steps, seconds, evaluation, files }))
+}
+
+pub(super) fn corrupt(files: &RunFiles, file: &str, what: String) -> ReportError {
+    ReportError::Corrupt { path: files.place(file), what }
+}
+
+/// The bytes of a file; `None` if there is none.
+pub(super) fn read_bytes(files: &RunFiles, file: &str) -> Result<Option<Vec<u8>>, ReportError> {
+    files.read(file).map_err(|source| ReportError::Read { path: files.place(file), source })
 }
 
 /// Reads a file of ours; `None` if there is none. The version is looked at first: what another
 /// version wrote is not damaged.
-pub(super) fn read_json<T: DeserializeOwned>(path: &Path) -> Result<Option<T>, ReportError> {
-    let text = match read_at_most(path, LARGEST_FILE) {
-        Ok(text) => text,
-        Err(error) if error.kind() == std::io::ErrorKind::NotFound => return Ok(None),
-        Err(source) => return Err(ReportError::Read { path: path.to_path_buf(), source }),
-    };
-    let corrupt = |what: String| ReportError::Corrupt { path: path.to_path_buf(), what };
+pub(super) fn read_json<T: DeserializeOwned>(
+    files: &RunFiles,
+    file: &str,
+) -> Result<Option<T>, ReportError> {
+    let Some(text) = read_bytes(files, file)? else { return Ok(None) };
+    let corrupt = |what: String| corrupt(files, file, what);
     let value: serde_json::Value =
         serde_json::from_slice(&text).map_err(|error| corrupt(error.to_string()))?;
     let found = value.get("schema").and_then(serde_json::Value::as_u64);
     let found = found.ok_or_else(|| corrupt("it names no schema version".to_owned()))?;
     if found != u64::from(SCHEMA) {
-        return Err(ReportError::Schema { path: path.to_path_buf(), found, expected: SCHEMA });
+        return Err(ReportError::Schema { path: files.place(file), found, expected: SCHEMA });
     }
     serde_json::from_value(value).map(Some).map_err(|error| corrupt(error.to_string()))
 }
@@ -360,18 +390,9 @@ fn nominal() -> Chance {
 }
 
 /// The evaluation that the episodes of another program amount to; `None` if there is no such file.
-fn read_episodes(
-    path: &Path,
-    env: &str,
-    eta: f64,
-    seed: u64,
-) -> Result<Option<Evaluation>, ReportError> {
-    let text = match read_at_most(path, LARGEST_FILE) {
-        Ok(text) => text,
-        Err(error) if error.kind() == std::io::ErrorKind::NotFound => return Ok(None),
-        Err(source) => return Err(ReportError::Read { path: path.to_path_buf(), source }),
-    };
-    let corrupt = |what: String| ReportError::Corrupt { path: path.to_path_buf(), what };
+fn read_episodes(files: &RunFiles, file: &str) -> Result<Option<Evaluation>, ReportError> {
+    let Some(text) = read_bytes(files, file)? else { return Ok(None) };
+    let corrupt = |what: String| corrupt(files, file, what);
     let mut episodes: Vec<Episode> = Vec::new();
     for line in csv::Reader::from_reader(&text[..]).deserialize() {
         episodes.push(line.map_err(|error| corrupt(error.to_string()))?);
@@ -402,9 +423,9 @@ fn read_episodes(
     }
     Ok(Some(Evaluation {
         schema: SCHEMA,
-        env: env.to_owned(),
-        eta,
-        seed,
+        env: files.name.world.clone(),
+        eta: files.name.eta,
+        seed: files.name.seed,
         steps: 0,
         seconds: 0.0,
         plays,
@@ -414,12 +435,10 @@ fn read_episodes(
 }
 
 /// What the types of an evaluation do not promise.
-fn check(evaluation: &Evaluation, env: &str, eta: f64, seed: u64) -> Result<(), String> {
-    let (its_env, its_eta, its_seed) = (&evaluation.env, evaluation.eta, evaluation.seed);
-    if its_env != env || its_eta != eta || its_seed != seed {
-        return Err(format!(
-            "it belongs to {its_env}/eta-{its_eta}/seed-{its_seed}, not into this folder"
-        ));
+fn check(evaluation: &Evaluation, name: &RunName) -> Result<(), String> {
+    let (env, eta, seed) = (&evaluation.env, evaluation.eta, evaluation.seed);
+    if *env != name.world || eta != name.eta || seed != name.seed {
+        return Err(format!("it belongs to {env}/eta-{eta}/seed-{seed}, not into this folder"));
     }
     for play in &evaluation.plays {
         let kind = format!("{:?} play under {:?} chance", play.protagonist, play.chance);
@@ -431,7 +450,9 @@ fn check(evaluation: &Evaluation, env: &str, eta: f64, seed: u64) -> Result<(), 
             .iter()
             .any(|atom| !atom.value.is_finite() || !(0.0..=1.0 + 1e-6).contains(&atom.mass))
         {
-            return Err(format!("{kind} has a return or probability that is none"));
+            return Err(format!(
+                "{kind} has a return or a probability that is not a number in its range"
+            ));
         }
         if atoms.windows(2).any(|pair| pair[0].value > pair[1].value) {
             return Err(format!("{kind} has returns out of order"));

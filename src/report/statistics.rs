@@ -27,6 +27,7 @@ use crate::game::returns::{Atom, ReturnLaw};
 use lava_envs::random::ChaCha8Rng;
 use rand::RngExt as _;
 use rand_distr::{Binomial, Distribution as _};
+use statrs::distribution::{ContinuousCDF as _, StudentsT};
 
 /// Coverage of every interval.
 pub const LEVEL: f64 = 0.95;
@@ -130,33 +131,14 @@ pub fn paired_difference(differences: &[f64]) -> Option<Estimate> {
 
 /// Quantile of Student's t at (1 + LEVEL) / 2 with `freedom` >= 1 degrees of freedom.
 ///
-/// With t = sqrt(freedom) tan(theta), P(|T| <= t) is a finite sum in theta (Abramowitz & Stegun
-/// 26.7.3 and 26.7.4), increasing on (0, pi/2): bisection finds theta.
+/// # Panics
+/// If `freedom` is 0.
 pub fn student_quantile(freedom: usize) -> f64 {
-    let within = |theta: f64| {
-        let (sin, cos) = theta.sin_cos();
-        let odd = freedom % 2 == 1;
-        let (mut term, mut sum, mut power) = if odd { (cos, 0.0, 1) } else { (1.0, 0.0, 0) };
-        while power + 2 <= freedom {
-            sum += term;
-            power += 2;
-            term *= cos * cos * (power - 1) as f64 / power as f64;
-        }
-        if odd { (theta + sin * sum) * std::f64::consts::FRAC_2_PI } else { sin * sum }
-    };
-    let (mut low, mut high) = (0.0, std::f64::consts::FRAC_PI_2);
-    for _ in 0..100 {
-        let middle = 0.5 * (low + high);
-        if within(middle) < LEVEL {
-            low = middle;
-        } else {
-            high = middle;
-        }
-    }
-    (freedom as f64).sqrt() * low.tan()
+    let law = StudentsT::new(0.0, 1.0, freedom as f64).expect("at least one degree of freedom");
+    law.inverse_cdf(0.5 * (1.0 + LEVEL))
 }
 
-/// Redraws the episodes behind a law with replacement. An exact law stays what it is.
+/// Redraws the episodes of a law with replacement. An exact law stays what it is.
 ///
 /// The answer knows no number of episodes: whether a tail is thick enough is asked of the original.
 pub fn redraw(law: &ReturnLaw, random: &mut ChaCha8Rng) -> ReturnLaw {
@@ -167,7 +149,7 @@ pub fn redraw(law: &ReturnLaw, random: &mut ChaCha8Rng) -> ReturnLaw {
     for (index, atom) in law.atoms().iter().enumerate() {
         let last = index + 1 == law.atoms().len();
         let share = if last { 1.0 } else { (atom.mass / mass_left).clamp(0.0, 1.0) };
-        // Binomial::new refuses probabilities outside [0, 1] alone; 0/0 of spent mass is such a one.
+        // Binomial::new refuses only probabilities outside [0, 1] and NaN, which 0/0 of a mass that is used up gives.
         let count = Binomial::new(left, share).map_or(0, |binomial| binomial.sample(random));
         left -= count;
         mass_left -= atom.mass;

@@ -3,17 +3,18 @@
 //! [`COLUMNS`] is the one description of the table: key, heading, what it means, how it is computed
 //! and formatted. Every output format ([`super::render`]) is rendered from it, the legend too.
 //!
-//! Several results folders, say of several methods or ablations, make one table with a row per world,
-//! eta and folder; the first folder is then what the others are compared with.
+//! Methods and variants in one folder, and several folders, make one table with a row per world, eta and
+//! name; the first name (`game`, or the first folder) is what the others are compared with.
 //!
 //! Best values are marked by interval, not by digit: the best value of a column and all those whose
 //! interval reaches into its interval.
 
-use super::group::Group;
+use super::group::{Group, groups};
 use super::runs::{Run, Runs};
 use super::statistics::{self, Estimate, Interval};
-use crate::experiment::artefacts::{Audit, Chance, Mode};
+use crate::experiment::artefacts::{Audit, Chance};
 use crate::game::returns::ReturnLaw;
+use crate::learn::policy::Mode;
 
 /// Standard errors below zero at which the slack of the bound is called a leak. Over a hundred runs
 /// chance alone does that once in 300 tables.
@@ -29,7 +30,7 @@ pub enum Block {
     Returns,
     /// Comparison with eta = 1, the game, certificates.
     Game,
-    /// Comparison with the first results folder.
+    /// Comparison with the first method or results folder.
     Comparison,
     /// The cross matrix: every policy at every level.
     Cross,
@@ -42,15 +43,16 @@ impl Block {
     pub const ALL: [Block; 5] =
         [Block::Returns, Block::Game, Block::Comparison, Block::Cross, Block::Cost];
 
-    /// What stands above it.
-    pub fn title(self) -> &'static str {
+    /// Its heading in a table.
+    pub fn title(self, table: &Table) -> String {
         match self {
             Block::Returns => "greedy protagonist under nominal chance",
             Block::Game => "against eta = 1, the game, certificates",
-            Block::Comparison => "against the first results folder",
+            Block::Comparison => return format!("against {}", table.first),
             Block::Cross => "CVaR of the greedy protagonist at every level",
             Block::Cost => "wall-clock time of training",
         }
+        .to_owned()
     }
 }
 
@@ -121,9 +123,9 @@ pub struct Column {
 
 /// What a row is compared with.
 struct Others<'a> {
-    /// The row of the same folder at eta = 1.
+    /// The row of the same name at eta = 1.
     neutral: Option<&'a Group<'a>>,
-    /// The row of the first folder at the same eta, if there are several folders.
+    /// The row of the first name at the same eta, if there are several names.
     first: Option<&'a Group<'a>>,
 }
 
@@ -425,7 +427,7 @@ pub static COLUMNS: [Column; 31] = [
         blocks: &[Block::Comparison],
         format: Format::Estimate(3),
         best: Best::None,
-        meaning: "CVaR_1/eta minus that of the first results folder at the same eta and seed",
+        meaning: "CVaR_1/eta minus that of the first method or folder at the same eta and seed",
         compute: |group, others| gain(group, others.first),
     },
     Column {
@@ -443,7 +445,7 @@ pub static COLUMNS: [Column; 31] = [
         blocks: &[Block::Comparison],
         format: Format::Estimate(2),
         best: Best::None,
-        meaning: "probability that a run of the row beats a run of the first folder in CVaR_1/eta",
+        meaning: "probability that a run of the row beats a run of the first method or folder in CVaR_1/eta",
         compute: |group, others| improvement(group, others.first),
     },
     Column {
@@ -475,20 +477,26 @@ pub static COLUMNS: [Column; 31] = [
     },
 ];
 
-/// One world and eta, in one results folder.
+/// One world and eta, of one method and variant in one results folder.
 #[derive(Debug, Clone)]
 pub struct Row {
     /// Budget eta.
     pub eta: f64,
     /// Name of the results folder.
     pub folder: String,
+    /// Method of training.
+    pub method: String,
+    /// Variant of the method.
+    pub variant: Option<String>,
+    /// What tables with several names call it.
+    pub name: String,
     /// Number of seeds, failed ones included.
     pub seeds: usize,
     /// Number of failed ones.
     pub failures: usize,
     /// One cell per entry of [`COLUMNS`].
     pub cells: Vec<Cell>,
-    /// Whether the cell is the best of its column, or not told apart from it.
+    /// Whether the cell is the best of its column, or not distinguishable from it.
     pub best: Vec<bool>,
 }
 
@@ -497,7 +505,7 @@ pub struct Row {
 pub struct World {
     /// Its name.
     pub name: String,
-    /// By eta, then in the order of the folders.
+    /// By eta, then in the order of the names.
     pub rows: Vec<Row>,
     /// How many episodes its numbers rest on.
     pub episodes: String,
@@ -513,21 +521,65 @@ impl World {
     }
 }
 
-/// The results of one folder.
+/// The results of one method and variant in one folder.
 pub struct Results<'a> {
-    /// The folder's name.
-    pub name: &'a str,
-    /// Its runs.
-    pub runs: &'a Runs,
-    /// The same, measured.
+    /// Heading of the column of names, `folder` or `method`, in tables that need one.
+    heading: Option<&'static str>,
+    folder: String,
+    name: String,
+    /// Its runs, measured.
     pub groups: Vec<Group<'a>>,
+    /// What its reader must know.
+    notes: Vec<String>,
+}
+
+impl<'a> Results<'a> {
+    /// The results of folders, by folder, then by method and variant.
+    pub fn of(folders: &[(&str, &'a Runs)]) -> Vec<Results<'a>> {
+        let several = folders.len() > 1;
+        folders
+            .iter()
+            .flat_map(|(folder, runs)| Results::of_folder(folder, runs, several))
+            .collect()
+    }
+
+    fn of_folder(folder: &str, runs: &'a Runs, several: bool) -> Vec<Results<'a>> {
+        let mut results: Vec<Results> = Vec::new();
+        for group in groups(runs) {
+            if let Some(last) = results.last_mut().filter(|of| of.method() == group.method.as_ref())
+            {
+                last.groups.push(group);
+                continue;
+            }
+            let (heading, name) = match &group.method {
+                None if several => (Some("folder"), folder.to_owned()),
+                None => (None, folder.to_owned()),
+                Some(method) if several => (Some("folder"), format!("{folder}/{method}")),
+                Some(method) => (Some("method"), method.clone()),
+            };
+            let (folder, notes) = (folder.to_owned(), Vec::new());
+            results.push(Results { heading, folder, name, groups: vec![group], notes });
+        }
+        let own = runs.runs.iter().flat_map(warnings).chain(runs.notes.iter().cloned());
+        let said = |note| if several { format!("{folder}: {note}") } else { note };
+        if let Some(first) = results.first_mut() {
+            first.notes = own.map(said).collect();
+        }
+        results
+    }
+
+    fn method(&self) -> Option<&String> {
+        self.groups.first().and_then(|group| group.method.as_ref())
+    }
 }
 
 /// All that is printed.
 #[derive(Debug, Clone)]
 pub struct Table {
-    /// Whether its rows are of several folders.
-    pub compares: bool,
+    /// Heading of the column of names; `None` if there is only one and it goes without saying.
+    pub heading: Option<&'static str>,
+    /// The name that the others are compared with.
+    pub first: String,
     /// By name.
     pub worlds: Vec<World>,
     /// What a reader must know before trusting a number: failures, violations, runs left out.
@@ -535,23 +587,20 @@ pub struct Table {
 }
 
 impl Table {
-    /// Computes every cell. The first folder is what others are compared with.
+    /// Computes every cell. The first results are what the others are compared with.
     pub fn new(results: &[Results]) -> Table {
-        let compares = results.len() > 1;
         let groups = || results.iter().flat_map(|results| &results.groups);
         let mut names: Vec<&str> = groups().map(|group| group.env).collect();
         names.sort_unstable();
         names.dedup();
         let worlds = names.iter().map(|name| world(name, results)).collect();
-        let mut notes = Vec::new();
-        for Results { name, runs, .. } in results {
-            let own = runs.runs.iter().flat_map(warnings).chain(runs.notes.iter().cloned());
-            notes.extend(own.map(|note| if compares { format!("{name}: {note}") } else { note }));
-        }
+        let mut notes: Vec<String> =
+            results.iter().flat_map(|results| results.notes.iter().cloned()).collect();
         let fewest = groups().map(|group| group.runs.len()).min().unwrap_or_default();
         if fewest == 1 {
             notes.push(
-                "Rows of one seed have no interval: nobody knows how seeds differ.".to_owned(),
+                "Rows of one seed have no interval: one seed does not show how seeds differ."
+                    .to_owned(),
             );
         } else if fewest < FEW_SEEDS {
             notes.push(format!(
@@ -560,7 +609,14 @@ impl Table {
                  interval, keeps its 95 %."
             ));
         }
-        Table { compares, worlds, notes }
+        let first = results.first();
+        let heading = first.and_then(|first| first.heading);
+        Table {
+            heading,
+            first: first.map_or(String::new(), |first| first.name.clone()),
+            worlds,
+            notes,
+        }
     }
 }
 
@@ -580,7 +636,10 @@ fn world(name: &str, results: &[Results]) -> World {
             };
             rows.push(Row {
                 eta: group.eta,
-                folder: of.name.to_owned(),
+                folder: of.folder.clone(),
+                method: group.runs[0].name.method.clone(),
+                variant: group.runs[0].name.variant.clone(),
+                name: of.name.clone(),
                 seeds: group.runs.len(),
                 failures: group.failures(),
                 cells: COLUMNS.iter().map(|column| (column.compute)(group, &others)).collect(),
@@ -589,13 +648,13 @@ fn world(name: &str, results: &[Results]) -> World {
             all.push(group);
         }
     }
-    // Stable: within an eta the folders keep their order.
+    // Stable: within an eta the names keep their order.
     rows.sort_by(|a, b| a.eta.total_cmp(&b.eta));
     mark(&mut rows);
     World { name: name.to_owned(), rows, episodes: episodes(&all), checks: checks(&all) }
 }
 
-/// Marks the best value of each column and what cannot be told apart from it.
+/// Marks the best value of each column and what is not distinguishable from it.
 fn mark(rows: &mut [Row]) {
     for (place, column) in COLUMNS.iter().enumerate() {
         match column.best {
@@ -634,7 +693,7 @@ fn mark_among(rows: &mut [Row], place: usize, sign: f64) {
 /// What is wrong with a run.
 fn warnings(run: &Run) -> Vec<String> {
     let mut warnings = Vec::new();
-    let name = run.name();
+    let name = &run.name;
     if let Some(failure) = &run.failure {
         let counted = if run.evaluation.is_some() {
             "Its evaluation counts all the same."
@@ -648,9 +707,11 @@ fn warnings(run: &Run) -> Vec<String> {
         && audit.violations > 0
     {
         warnings.push(format!(
-            "BUDGET VIOLATED: {name}, {} times in {} trajectories (largest use {:.6} of the budget): \
+            "BUDGET VIOLATED: {name}, {} in {} (largest use {:.6} of the budget): \
              its game value proves nothing.",
-            audit.violations, audit.trajectories, audit.max_budget_use
+            counted(audit.violations, "violation"),
+            counted(audit.trajectories, "trajectory"),
+            audit.max_budget_use
         ));
     }
     if let Some((slack, error)) = slack(run)
@@ -667,7 +728,7 @@ fn warnings(run: &Run) -> Vec<String> {
 
 /// Game value minus sampled CVaR_1/eta of a run with an antagonist, and its standard error.
 fn slack(run: &Run) -> Option<(f64, f64)> {
-    let nominal = run.law(Mode::Sampled, Chance::Nominal).filter(|_| run.eta > 1.0)?;
+    let nominal = run.law(Mode::Sampled, Chance::Nominal).filter(|_| run.name.eta > 1.0)?;
     let game = run.game_law(Mode::Sampled)?;
     let slack = game.mean() - statistics::cvar(nominal, run.alpha())?;
     Some((slack, game.mean_standard_error().hypot(nominal.cvar_standard_error(run.alpha()))))
@@ -687,9 +748,9 @@ fn checks(groups: &[&Group]) -> String {
         let violations: u64 = audits.iter().map(|audit| audit.violations).sum();
         let most = audits.iter().map(|audit| audit.max_budget_use).fold(0.0, f64::max);
         checks += &format!(
-            "Budget audit: {} violations in {} trajectories, largest use {most:.6} of the budget. ",
-            thousands(violations),
-            thousands(trajectories)
+            "Budget audit: {} in {}, largest use {most:.6} of the budget. ",
+            counted(violations, "violation"),
+            counted(trajectories, "trajectory")
         );
     }
     let slacks: Vec<(f64, f64)> = runs().filter_map(slack).collect();
@@ -698,8 +759,8 @@ fn checks(groups: &[&Group]) -> String {
         let least = slacks.iter().map(|(slack, _)| *slack).fold(f64::INFINITY, f64::min);
         checks += &format!(
             "Bound: game value not below the sampled CVaR_1/eta beyond sampling error in {kept} of {} \
-             runs (least difference {least:.4}).",
-            slacks.len()
+             (least difference {least:.4}).",
+            counted(slacks.len() as u64, "run")
         );
     }
     checks.trim_end().to_owned()
@@ -723,6 +784,16 @@ fn episodes(groups: &[&Group]) -> String {
         Some(format!("{name} {range}{}", said(most)))
     });
     format!("Episodes per run: {}", parts.collect::<Vec<String>>().join(", "))
+}
+
+/// A number of things: `1 run`, `2 runs`.
+fn counted(number: u64, of: &str) -> String {
+    let ending = match (number, of.strip_suffix('y')) {
+        (1, _) => of.to_owned(),
+        (_, Some(stem)) => format!("{stem}ies"),
+        (_, None) => format!("{of}s"),
+    };
+    format!("{} {ending}", thousands(number))
 }
 
 /// A whole number with separators: 100,000.

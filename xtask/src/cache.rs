@@ -1,8 +1,8 @@
 //! The user's cache: one folder per version of libtorch, shared by all checkouts.
 //!
-//! A libtorch is made ready in a staging folder beside its place and moved there by one rename, so
-//! a broken download is never mistaken for a libtorch. A file lock lets one set-up work at a time;
-//! the kernel drops it when its holder dies, so none is ever left behind.
+//! A libtorch is made ready in a staging folder next to its place and moved there by one rename, so
+//! a broken download is not mistaken for a libtorch. A file lock admits one set-up at a time;
+//! the kernel releases it when the process ends, so no lock outlasts its process.
 
 use std::fs::{self, File, TryLockError};
 use std::path::{Path, PathBuf};
@@ -13,7 +13,7 @@ use crate::libtorch::{self, Environment, VERSION};
 use crate::{tools, wheels};
 
 /// Room for one download: pip holds torch's wheel (527 MB) twice for a moment; afterwards the
-/// wheels (540 MB) stand beside the unpacked files (490 MB).
+/// wheels (540 MB) and the unpacked files (490 MB) are there together.
 const ROOM_NEEDED: u64 = 1_300_000_000;
 
 /// How the names of staging folders begin.
@@ -21,13 +21,9 @@ const STAGING: &str = ".partial-";
 
 /// The cache of this program in the user's cache.
 pub fn root(environment: &Environment) -> Result<PathBuf> {
-    // By the XDG specification a relative path is to be ignored.
-    let absolute = |name: &Option<_>| name.as_ref().map(PathBuf::from).filter(|p| p.is_absolute());
-    let caches = absolute(&environment.xdg_cache_home)
-        .or_else(|| absolute(&environment.home).map(|home| home.join(".cache")));
-    match caches {
-        Some(caches) => Ok(caches.join("cvar-game")),
-        None => bail!("no place for libtorch: set HOME or XDG_CACHE_HOME to an absolute path"),
+    match &environment.caches {
+        Some(caches) if caches.is_absolute() => Ok(caches.join("cvar-game")),
+        _ => bail!("no place for libtorch: set HOME or XDG_CACHE_HOME to an absolute path"),
     }
 }
 
@@ -35,7 +31,7 @@ fn folder_name() -> String {
     format!("libtorch-{VERSION}-cpu-x86_64")
 }
 
-/// Returns the folder of our libtorch in the cache, after fetching it if it is not there whole.
+/// Returns the folder of our libtorch in the cache, after fetching it if it is absent or incomplete.
 pub fn provide(root: &Path) -> Result<PathBuf> {
     let libtorch = root.join(folder_name());
     if check(&libtorch).is_ok() {
@@ -56,20 +52,20 @@ pub fn provide(root: &Path) -> Result<PathBuf> {
     tools::check_pip()?;
     check_room(root)?;
     println!("fetching libtorch {VERSION} (540 MB) into {}", root.display());
-    // Its name is new each time: the pip of a killed set-up may live on and write into the old one.
+    // Its name is new each time: the pip of a killed set-up may still run and write into the old one.
     let staging = tempfile::Builder::new()
         .prefix(STAGING)
         .tempdir_in(root)
         .with_context(|| format!("cannot create a folder in {}", root.display()))?;
     let made = make(staging.path(), &libtorch);
-    // Whatever happened, no half gigabyte stays behind; an error of `make` says more than ours.
+    // The half gigabyte is removed in any case; an error of `make` is more precise than ours.
     let cleared = staging.close().context("cannot remove what was downloaded");
     made.and(cleared)?;
     println!("libtorch {VERSION} is in {}", libtorch.display());
     Ok(libtorch)
 }
 
-/// Removes what killed set-ups left. Under the lock no other one is at work.
+/// Removes the folders of killed set-ups. While the lock is held, no other set-up works.
 fn clear_stale(root: &Path) -> Result<()> {
     let reading = || format!("cannot read {}", root.display());
     for entry in fs::read_dir(root).with_context(reading)? {
@@ -88,17 +84,17 @@ fn make(staging: &Path, libtorch: &Path) -> Result<()> {
     println!("unpacking");
     let fresh = staging.join("libtorch");
     wheels::unpack(&wheels, &fresh)?;
-    let header = libtorch::version_in(&fresh).unwrap_or_else(|| "none that is known".into());
+    let header = libtorch::version_in(&fresh).unwrap_or_else(|| "unknown".into());
     ensure!(
         libtorch::is_right(&header),
-        "the package fetched holds libtorch of version {header} where {VERSION} was asked for; \
+        "the fetched package holds libtorch of version {header}, but {VERSION} is needed; \
          nothing was set up"
     );
     fs::write(fresh.join("build-version"), format!("{VERSION}\n"))
         .with_context(|| format!("cannot write into {}", fresh.display()))?;
     check(&fresh)?;
 
-    // A damaged libtorch goes out of the way by a rename too: there is never half of one in place.
+    // A damaged libtorch is moved away by a rename too, so its place never holds a part of one.
     if libtorch.exists() {
         let old = staging.join("old");
         fs::rename(libtorch, &old)
@@ -108,7 +104,7 @@ fn make(staging: &Path, libtorch: &Path) -> Result<()> {
         .with_context(|| format!("cannot move libtorch to {}", libtorch.display()))
 }
 
-/// Whether a libtorch of ours is whole and of the right version.
+/// Checks that a libtorch of ours is complete and of the right version.
 fn check(libtorch: &Path) -> Result<()> {
     let shown = libtorch.display();
     let version = libtorch::version_in(libtorch).unwrap_or_else(|| "unknown".into());
@@ -147,7 +143,7 @@ pub fn link(libtorch: &Path, link: &Path) -> Result<()> {
         .persist(link)
         .with_context(in_words)?;
     println!("linked as {}", link.display());
-    // Cargo looks at this file's date to see that the link leads elsewhere now. A shared cache may
+    // Cargo checks this file's date to see that the link has a new target. A shared cache may
     // be read-only, and then its libtorch has not moved either.
     if let Ok(library) = File::options().append(true).open(libtorch.join("lib/libtorch_cpu.so")) {
         library.set_modified(std::time::SystemTime::now()).ok();
@@ -162,7 +158,7 @@ fn lock(root: &Path) -> Result<File> {
     match file.try_lock() {
         Ok(()) => {}
         Err(TryLockError::WouldBlock) => {
-            println!("another set-up is at work; waiting for it");
+            println!("another set-up is running; waiting for it");
             file.lock().with_context(in_words)?;
         }
         Err(TryLockError::Error(error)) => return Err(error).with_context(in_words),
@@ -172,7 +168,7 @@ fn lock(root: &Path) -> Result<File> {
 
 fn check_room(root: &Path) -> Result<()> {
     let free = rustix::fs::statvfs(root)
-        .with_context(|| format!("cannot tell the free space of {}", root.display()))?;
+        .with_context(|| format!("cannot determine the free space of {}", root.display()))?;
     ensure_room(free.f_bavail.saturating_mul(free.f_frsize), root)
 }
 
@@ -202,21 +198,14 @@ fn create(folder: &Path) -> Result<()> {
 mod tests {
     use super::*;
 
-    fn with(xdg_cache_home: Option<&str>, home: Option<&str>) -> Environment {
-        Environment {
-            xdg_cache_home: xdg_cache_home.map(Into::into),
-            home: home.map(Into::into),
-            ..Environment::default()
-        }
-    }
-
     #[test]
-    fn the_cache_follows_the_xdg_specification() {
-        let root = |xdg, home| root(&with(xdg, home)).ok();
-        assert_eq!(root(Some("/x"), Some("/home/a")), Some("/x/cvar-game".into()));
-        assert_eq!(root(None, Some("/home/a")), Some("/home/a/.cache/cvar-game".into()));
-        assert_eq!(root(Some("x"), Some("/home/a")), Some("/home/a/.cache/cvar-game".into()));
-        assert_eq!(root(Some(""), None), None);
+    fn the_cache_needs_an_absolute_folder() {
+        let root = |caches: Option<&str>| {
+            root(&Environment { caches: caches.map(Into::into), ..Environment::default() }).ok()
+        };
+        assert_eq!(root(Some("/home/a/.cache")), Some("/home/a/.cache/cvar-game".into()));
+        assert_eq!(root(Some(".cache")), None);
+        assert_eq!(root(None), None);
     }
 
     #[test]
@@ -259,7 +248,7 @@ mod tests {
         assert!(link(Path::new("/a"), &at).is_err());
     }
 
-    /// Two set-ups of one repository at once once failed with "File exists".
+    /// Two simultaneous set-ups of one repository once failed with "File exists".
     #[test]
     fn set_ups_at_once_agree_on_the_link() {
         let folder = tempfile::tempdir().expect("a temporary folder");

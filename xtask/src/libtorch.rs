@@ -9,11 +9,12 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 
 use anyhow::{Context, Result, bail, ensure};
+use etcetera::base_strategy::{BaseStrategy as _, Xdg};
 
 /// The one version that tch 0.26 binds.
 pub const VERSION: &str = "2.13.0";
 
-/// What decides about libtorch, read once so that the decision itself is a pure function.
+/// What decides which libtorch is used, read once so that the decision itself is a pure function.
 #[derive(Debug, Clone, Default)]
 pub struct Environment {
     /// The link in the repository that stands for our own libtorch.
@@ -22,8 +23,8 @@ pub struct Environment {
     pub use_pytorch: bool,
     pub in_virtual_env: bool,
     pub bypass_version_check: bool,
-    pub xdg_cache_home: Option<OsString>,
-    pub home: Option<OsString>,
+    /// The user's cache folder by the XDG specification.
+    pub caches: Option<PathBuf>,
 }
 
 impl Environment {
@@ -35,8 +36,7 @@ impl Environment {
             use_pytorch: is_set("LIBTORCH_USE_PYTORCH"),
             in_virtual_env: is_set("VIRTUAL_ENV"),
             bypass_version_check: is_set("LIBTORCH_BYPASS_VERSION_CHECK"),
-            xdg_cache_home: std::env::var_os("XDG_CACHE_HOME"),
-            home: std::env::var_os("HOME"),
+            caches: Xdg::new().ok().map(|user| user.cache_dir()),
         }
     }
 }
@@ -44,7 +44,7 @@ impl Environment {
 /// Whose libtorch a build takes.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Choice {
-    /// The one that `cargo xtask setup` provides.
+    /// The one that `cargo xtask torch` provides.
     Ours,
     /// The folder that the user's `LIBTORCH` names.
     Folder(PathBuf),
@@ -65,7 +65,7 @@ pub fn choose(environment: &Environment) -> Choice {
 /// Checks a libtorch that the user brought and returns a sentence about it.
 pub fn check_users(choice: &Choice, environment: &Environment) -> Result<String> {
     let (source, version) = match choice {
-        Choice::Ours => return Ok("libtorch is provided by cargo xtask setup".into()),
+        Choice::Ours => return Ok("libtorch is provided by cargo xtask torch".into()),
         Choice::Folder(folder) => {
             let source = format!("LIBTORCH={}", folder.display());
             (source, version_of_users_folder(folder)?)
@@ -82,19 +82,21 @@ pub fn check_users(choice: &Choice, environment: &Environment) -> Result<String>
         return Ok(format!("using {source}: its version is not known, {VERSION} is needed"));
     };
     if environment.bypass_version_check {
-        return Ok(format!("using {source}: version {version}, unchecked as you asked"));
+        return Ok(format!(
+            "using {source}: version {version}, not checked, as LIBTORCH_BYPASS_VERSION_CHECK is set"
+        ));
     }
     ensure!(
         is_right(&version),
         "{source} has version {version}, but tch needs {VERSION}; point it at libtorch {VERSION}, \
-         or unset it to use the one of `cargo xtask setup`"
+         or unset it to use the one of `cargo xtask torch`"
     );
     Ok(format!("using {source}: version {version}, nothing to set up"))
 }
 
 fn version_of_users_folder(folder: &Path) -> Result<Option<String>> {
     let what_to_do = "name the folder that holds include/ and lib/ by its absolute path, or unset \
-                      LIBTORCH to use the one of `cargo xtask setup`";
+                      LIBTORCH to use the one of `cargo xtask torch`";
     let shown = folder.display();
     // torch-sys' build script runs in a folder of its own, so a relative path would miss.
     ensure!(folder.is_absolute(), "LIBTORCH={shown} is not an absolute path; {what_to_do}");
@@ -106,7 +108,7 @@ fn version_of_users_folder(folder: &Path) -> Result<Option<String>> {
 fn version_of_pytorch(python: &str) -> Result<String> {
     let what_to_do = format!(
         "install torch {VERSION} there, or unset LIBTORCH_USE_PYTORCH to use the one of `cargo \
-         xtask setup`"
+         xtask torch`"
     );
     let answer = Command::new(python)
         .args(["-c", "import torch; print(torch.__version__)"])
@@ -120,7 +122,7 @@ fn version_of_pytorch(python: &str) -> Result<String> {
     Ok(String::from_utf8_lossy(&answer.stdout).trim().to_owned())
 }
 
-/// The version of the libtorch in `folder`, if a file there tells: `build-version` in the packages
+/// The version of the libtorch in `folder`, if a file there states it: `build-version` in the packages
 /// of libtorch, the header in those of Python, where it has moved over the years.
 pub fn version_in(folder: &Path) -> Option<String> {
     if let Ok(version) = std::fs::read_to_string(folder.join("build-version")) {
@@ -179,7 +181,7 @@ mod tests {
     }
 
     #[test]
-    fn a_header_tells_its_version() {
+    fn the_version_is_read_from_a_header() {
         let header = "#pragma once\n/// Major\n#define TORCH_VERSION_MAJOR 2\n\
                       #define TORCH_VERSION_MINOR 13\n#define TORCH_VERSION_PATCH 0\n\
                       #define TORCH_VERSION \\\n";

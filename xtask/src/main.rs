@@ -1,11 +1,10 @@
-//! Chores of the workspace: `cargo xtask setup`, `test`, `bench`, `ablations`, `speed`, `scaling`.
+//! Chores of the workspace: `cargo xtask torch`, `speed`, `scaling`.
 //!
-//! Training needs libtorch, a C++ library of 480 MB that cargo cannot fetch. `setup` fetches it
-//! once for all checkouts of one user and links it into this one; after that plain `cargo build`,
-//! `cargo test` and `cargo run` work with no environment variable (`.cargo/config.toml` and
-//! `build.rs` at the root do the rest). The other verbs run `setup` first, then cargo.
+//! Nothing here is needed to build, test or use the program. `torch` provides libtorch, a C++ library of
+//! 480 MB that cargo cannot fetch, and runs a cargo command with the feature `torch`: it fetches the
+//! library once for all checkouts of one user and links it into this one (`.cargo/config.toml` and
+//! `build.rs` at the root do the rest).
 
-mod ablations;
 mod cache;
 mod libtorch;
 mod scaling;
@@ -33,37 +32,21 @@ struct Arguments {
 
 #[derive(Subcommand)]
 enum Verb {
-    /// Provide libtorch: fetch it once into the user's cache and link it here as .libtorch
-    Setup,
-    /// Set up, then run the tests of the whole workspace
-    Test {
-        /// Passed on to `cargo test --workspace`
+    /// Provide libtorch, then run a cargo command with the feature `torch`: `torch build --release`
+    Torch {
+        /// The cargo command and its arguments; without one, libtorch is only provided
         #[arg(trailing_var_arg = true, allow_hyphen_values = true)]
-        passed_on: Vec<OsString>,
+        command: Vec<OsString>,
     },
-    /// Set up, then run the quick benchmark (configs/quick.toml) with the release build
-    Bench {
-        /// Passed on to `cvar-game bench`
-        #[arg(trailing_var_arg = true, allow_hyphen_values = true)]
-        passed_on: Vec<OsString>,
-    },
-    /// Set up, then run what configs/paper.toml is compared with; results go to results/ablations
-    Ablations {
-        /// One of them; without it, all that are not there yet
-        only: Option<String>,
-    },
-    /// Set up, then measure what training costs against its sizes; results go to results/speed
+    /// Measure what training costs against its sizes; results go to results/speed
     Scaling,
-    /// Set up, then measure the speed of training and its parts; the table goes to target/speed.md
+    /// Measure the speed of training and its parts; the table goes to target/speed.md
     Speed {
         /// Passed on to the benchmarks, such as a filter of their names: `rollout`
         #[arg(trailing_var_arg = true, allow_hyphen_values = true)]
         passed_on: Vec<OsString>,
     },
 }
-
-/// Builds both programs.
-const BUILD: [&str; 3] = ["build", "--release", "--bins"];
 
 fn main() -> ExitCode {
     match run(Arguments::parse().verb) {
@@ -77,29 +60,17 @@ fn main() -> ExitCode {
 
 fn run(verb: Verb) -> Result<ExitCode> {
     let repository = repository()?;
-    set_up(&repository)?;
     match verb {
-        Verb::Setup => Ok(ExitCode::SUCCESS),
-        Verb::Test { passed_on } => cargo(&repository, &["test", "--workspace"], &passed_on),
-        Verb::Bench { passed_on } => {
-            // `cargo run` alone would build one of the two programs.
-            let code = cargo(&repository, &BUILD, &[])?;
-            if code != ExitCode::SUCCESS {
-                return Ok(code);
+        Verb::Torch { command } => {
+            provide_libtorch(&repository)?;
+            if command.is_empty() {
+                return Ok(ExitCode::SUCCESS);
             }
-            let bench = ["--", "bench", "--config", "configs/quick.toml"];
-            let run = ["run", "--release", "--bin", "cvar-game"];
-            cargo(&repository, &[run, bench].concat(), &passed_on)
-        }
-        Verb::Ablations { only } => {
-            let code = cargo(&repository, &BUILD, &[])?;
-            if code != ExitCode::SUCCESS {
-                return Ok(code);
-            }
-            ablations::run(&repository, &speed::target(&repository), only.as_deref())
+            cargo(&repository, &with_feature(command))
         }
         Verb::Scaling => {
-            let code = cargo(&repository, &BUILD, &[])?;
+            let build = ["build", "--release"].map(OsString::from);
+            let code = cargo(&repository, &build)?;
             if code == ExitCode::SUCCESS {
                 scaling::measure(&repository, &speed::target(&repository))?;
             }
@@ -120,7 +91,15 @@ fn run(verb: Verb) -> Result<ExitCode> {
     }
 }
 
-/// The root of the checkout. Cargo says where this crate lies now, also after the checkout moved.
+/// A cargo command with the feature `torch`, which is put after the command's own name: what follows
+/// `--` is not cargo's.
+fn with_feature(mut command: Vec<OsString>) -> Vec<OsString> {
+    let feature = ["--features", "cvar-game/torch"].map(OsString::from);
+    command.splice(1..1, feature);
+    command
+}
+
+/// The root of the checkout. Cargo reports where this crate is now, also after the checkout moved.
 fn repository() -> Result<PathBuf> {
     let manifest = std::env::var_os("CARGO_MANIFEST_DIR")
         .context("run this by cargo: `cargo xtask VERB` inside the repository")?;
@@ -128,8 +107,8 @@ fn repository() -> Result<PathBuf> {
     Ok(root.to_path_buf())
 }
 
-/// Makes sure that there is a libtorch, whoever's, and a compiler to bind it.
-fn set_up(repository: &Path) -> Result<()> {
+/// Makes sure that there is a libtorch, ours or the user's, and a compiler for its bindings.
+fn provide_libtorch(repository: &Path) -> Result<()> {
     let environment = Environment::of_this_process(repository);
     match libtorch::choose(&environment) {
         Choice::Ours => {
@@ -146,10 +125,10 @@ fn set_up(repository: &Path) -> Result<()> {
     Ok(())
 }
 
-/// Runs cargo in the repository and hands on its exit code.
-fn cargo(repository: &Path, arguments: &[&str], passed_on: &[OsString]) -> Result<ExitCode> {
+/// Runs cargo in the repository and returns its exit code.
+fn cargo(repository: &Path, arguments: &[OsString]) -> Result<ExitCode> {
     let mut command = cargo_command(repository);
-    command.args(arguments).args(passed_on);
+    command.args(arguments);
     finish(command)
 }
 
@@ -182,11 +161,12 @@ mod tests {
     use super::*;
 
     #[test]
-    fn arguments_after_the_verb_are_passed_on() {
+    fn the_feature_is_given_to_cargo_and_not_to_the_tests() {
         let arguments =
-            Arguments::parse_from(["cargo xtask", "test", "--release", "--", "--nocapture"]);
-        let Verb::Test { passed_on } = arguments.verb else { panic!("not the verb `test`") };
-        assert_eq!(passed_on, ["--release", "--", "--nocapture"]);
+            Arguments::parse_from(["cargo xtask", "torch", "test", "--release", "--", "--ignored"]);
+        let Verb::Torch { command } = arguments.verb else { panic!("not the verb `torch`") };
+        let expected = ["test", "--features", "cvar-game/torch", "--release", "--", "--ignored"];
+        assert_eq!(with_feature(command), expected);
     }
 
     #[test]

@@ -58,7 +58,7 @@ const AXES: [Axis; 3] = [
 
 const WORLDS: [&str; 2] = ["lava-grid", "lava-point"];
 
-/// Environment steps per second of training, by world, axis and value, and what a second job gains.
+/// Environment steps per second of training, by world, axis and value, and the gain of a second job.
 pub fn measure(repository: &Path, target: &Path) -> Result<()> {
     let program = target.join("release").join("cvar-game");
     let mut speeds =
@@ -94,7 +94,7 @@ fn train(program: &Path, world: &str, options: &[String]) -> Result<f64> {
     let mut command = Command::new(program);
     command.args(["train", "--json", "--eta", "25", "--seed", "1", "--env", world, "--steps"]);
     command.arg(STEPS.to_string()).arg("--out").arg(out.path());
-    command.args(["--set", "evaluation.episodes=100", "--set", "evaluation.exhibit_episodes=100"]);
+    command.args(["--set", "evaluation.episodes=100", "--set", "evaluation.figure_episodes=100"]);
     for option in options {
         command.arg("--set").arg(option);
     }
@@ -103,10 +103,10 @@ fn train(program: &Path, world: &str, options: &[String]) -> Result<f64> {
         bail!("cvar-game failed: {}", String::from_utf8_lossy(&output.stderr));
     }
     let answer: serde_json::Value = serde_json::from_slice(&output.stdout)?;
-    answer["steps_per_second"].as_f64().context("the run tells no speed")
+    answer["steps_per_second"].as_f64().context("the run reports no speed")
 }
 
-/// Seconds of a sweep of eight equal runs in so many jobs, with its evaluations and its report.
+/// Seconds of a sweep of eight equal runs with `jobs` jobs, with its evaluations and its report.
 fn sweep(program: &Path, jobs: usize) -> Result<f64> {
     let out = tempfile::tempdir()?;
     let config = out.path().join("sweep.toml");
@@ -241,7 +241,7 @@ mod tests {
         let speeds: Vec<f64> = (0..WORLDS.len() * sizes).map(|i| 7e5 + 1e3 * i as f64).collect();
         draw(&path, &speeds).unwrap();
         let svg = std::fs::read_to_string(path).unwrap();
-        // The marks of the speeds are hundreds up to 700, none of the sizes.
+        // The marks of the speeds are hundreds up to 700; no size equals one of them.
         let all = || AXES.iter().flat_map(|axis| axis.values);
         for value in all() {
             let axes = all().filter(|&other| other == value).count();

@@ -1,4 +1,4 @@
-//! The benchmarks of speed as one table, out of the files that criterion leaves behind.
+//! The benchmarks of speed as one table, from the files that criterion writes.
 
 use std::ffi::OsString;
 use std::fs;
@@ -38,7 +38,7 @@ impl Row {
 
 /// What to run: the benchmarks of both crates.
 pub const CARGO: [&str; 9] =
-    ["bench", "-p", "cvar-learn", "-p", "lava-envs", "--bench", "speed", "--bench", "stepping"];
+    ["bench", "-p", "cvar-game", "-p", "lava-envs", "--bench", "speed", "--bench", "stepping"];
 
 /// Where cargo builds.
 pub fn target(repository: &Path) -> PathBuf {
@@ -138,7 +138,7 @@ fn table(rows: &[Row]) -> String {
     }
     text += &format!(
         "\nThe limit is {} environment steps per second and core: the arithmetic of four epochs, each\n\
-         about 3.5 kFLOP and 128 tanh per sample. Rows that do none of it, or but a part, have no share.\n",
+         about 3.5 kFLOP and 128 tanh per sample. Rows that do only a part of it, or nothing of it, have no share.\n",
         thousands(LIMIT)
     );
     text

@@ -8,11 +8,11 @@ use anyhow::{Result, bail, ensure};
 
 use crate::libtorch::VERSION;
 
-/// The packages fetched hold libraries for Linux with glibc on x86-64 alone.
+/// The packages fetched hold libraries only for Linux with glibc on x86-64.
 pub fn check_platform() -> Result<()> {
     ensure!(
         cfg!(all(target_os = "linux", target_arch = "x86_64", target_env = "gnu")),
-        "no ready-made libtorch for this platform ({} {}): the set-up knows Linux with glibc on \
+        "no ready-made libtorch for this platform ({} {}): the set-up supports Linux with glibc on \
          x86-64; install libtorch {VERSION} yourself and set LIBTORCH to its folder",
         env::consts::OS,
         env::consts::ARCH,
@@ -58,7 +58,7 @@ pub fn check_pip() -> Result<()> {
     );
     ensure!(
         quietly(Command::new("python3").args(["-m", "pip", "--version"])),
-        "`python3` has no pip; libtorch is fetched with it: install pip (on Debian or Ubuntu: \
+        "`python3` has no pip, which fetches libtorch: install pip (on Debian or Ubuntu: \
          apt-get install python3-pip; in a virtual environment: python3 -m ensurepip), or set \
          LIBTORCH to a libtorch {VERSION} of your own"
     );

@@ -1,9 +1,9 @@
 //! Where libtorch comes from: wheels of the Python package index, fetched by pip, and the few of
 //! their files that a build needs.
 //!
-//! The index has no package of libtorch alone, but the wheel of torch holds the C++ headers and
-//! libraries. Only its CPU library is taken. That library was built with CUDA support and asks the
-//! loader for two of CUDA's own libraries, which come from wheels of their own; no GPU is needed.
+//! The index has no package of only libtorch, but the wheel of torch holds the C++ headers and
+//! libraries. Only its CPU library is taken. That library was built with CUDA support and needs
+//! two of CUDA's own libraries, which come from wheels of their own; no GPU is needed.
 //! Wheels are pinned by version and digest, so everybody's libtorch is the same.
 
 use std::fs::{self, File};
@@ -21,7 +21,7 @@ nvidia-cuda-runtime==13.0.96 --hash=sha256:7f82250d7782aa23b6cfe765ecc7db554bd3c
 nvidia-cuda-cupti==13.0.85 --hash=sha256:4eb01c08e859bf924d222250d2e8f8b8ff6d3db4721288cf35d14252a4d933c8
 ";
 
-/// The same wheels whatever Python runs pip: nothing of Python's part is used. No cache of pip's,
+/// The same wheels whatever Python runs pip: nothing of Python's part is used. No cache of pip,
 /// which would keep half a gigabyte for a download that happens once.
 const PIP_ARGUMENTS: &str = "-m pip download --no-cache-dir --no-deps --only-binary=:all: \
     --require-hashes --disable-pip-version-check --no-input \
@@ -67,7 +67,7 @@ pub fn download(staging: &Path) -> Result<PathBuf> {
         .stderr(Stdio::piped())
         .spawn()
         .context("pip could not be started")?;
-    // pip's progress goes to the terminal by itself. Its complaints do so here, one by one, for it
+    // pip's progress goes to the terminal by itself. Its errors are printed here, one by one, for it
     // can try again for minutes; they are kept too, for our own message.
     let mut complaints = Vec::new();
     if let Some(stderr) = pip.stderr.take() {
@@ -80,14 +80,14 @@ pub fn download(staging: &Path) -> Result<PathBuf> {
     if !status.success() {
         bail!(
             "the download of libtorch failed: pip says: {}; check the network (pip's settings for \
-             proxies and mirrors hold), then run `cargo xtask setup` again",
+             proxies and mirrors hold), then run `cargo xtask torch` again",
             last_complaint(&complaints)
         );
     }
     Ok(wheels)
 }
 
-/// The line of pip's that says what went wrong.
+/// The line of pip's output that says what went wrong.
 fn last_complaint(lines: &[String]) -> &str {
     let is_error = |line: &&String| line.starts_with("ERROR:");
     let spoken = |line: &&String| !line.trim().is_empty();
@@ -112,7 +112,7 @@ pub fn unpack(wheels: &Path, libtorch: &Path) -> Result<()> {
     let lib = libtorch.join("lib");
     fs::create_dir_all(&lib)
         .and_then(|()| fs::write(lib.join("libtorch.so"), LIBTORCH_SO))
-        // The linker asks for -lgomp. Without this it would take the compiler's, if it has one.
+        // The linker looks for -lgomp. Without this it would take the compiler's, if it has one.
         .and_then(|()| std::os::unix::fs::symlink("libgomp.so.1", lib.join("libgomp.so")))
         .with_context(|| format!("cannot complete {}", lib.display()))?;
     Ok(())

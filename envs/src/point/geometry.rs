@@ -2,8 +2,8 @@
 //!
 //! During a substep the centre runs along a straight segment p(s) = p_0 + s (p_1 - p_0), s in [0, 1].
 //! The disc of radius r touches a rectangle exactly when its centre lies in the rectangle grown by r
-//! with rounded corners. That set is the union of the rectangle grown in x alone, the rectangle grown
-//! in y alone, and a disc at each corner; the first s at which a ray meets each of them has a closed
+//! with rounded corners. That set is the union of the rectangle grown only in x, the rectangle grown
+//! only in y, and a disc at each corner; the first s at which a ray meets each of them has a closed
 //! form, and the smallest one is the time of impact. (parry's general shape cast iterates and stops
 //! at a tolerance.)
 

@@ -10,7 +10,7 @@
 //! along the wall is untouched.
 //!
 //! # Why slots are bit for bit independent
-//! Rapier is used without memory. The state of a disc is position and velocity alone and is written
+//! Rapier is used without memory. The state of a disc is only its position and velocity; it is written
 //! into a Rapier body (a "seat") before each substep. Nothing else is carried over: impulses are not
 //! warm-started, contacts are not recycled, there is no restitution, and no body sleeps. Discs see
 //! walls and not each other (collision groups). Each wall is parallel to an axis and acts on one

@@ -19,7 +19,7 @@
 //! velocity 0; the axes do not act on each other. Lava and goal are tested along the straight path
 //! of each substep.
 //!
-//! Ends are a discontinuity in v+. Each node of v+ therefore stands for its cell: [`Events`] holds
+//! Ends are a discontinuity in v+. Each node of v+ therefore represents its cell: [`Events`] holds
 //! the shares of the cell that end in lava and in the goal.
 
 use super::Lattice;
@@ -30,7 +30,7 @@ use lava_envs::{End, PointConfig};
 const SAMPLES: usize = 3;
 
 /// How far in m the DP lets the disc into lava before it counts: nodes that lie on the border of
-/// lava or goal are then nodes just outside, and the values beside a border are interpolated between
+/// lava or goal are then nodes just outside, and the values next to a border are interpolated between
 /// nodes that all run on.
 const SLACK: f64 = 1e-4;
 

@@ -1,8 +1,11 @@
 //! Layers of keys: reading, checking against the default's keys, merging.
 
-use super::{ConfigError, DEFAULT, WorldName, one_line, rules};
+use super::annotated::Schema;
+use super::keys::{at, leaves, merge, nested};
+use super::{Catalogue, ConfigError, one_line};
+use crate::experiment::names::WorldName;
 use crate::files::read_text;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use toml::{Table, Value};
 
 /// Keys and values from one place.
@@ -10,54 +13,101 @@ use toml::{Table, Value};
 pub(super) struct Layer {
     /// The file or the option, for messages.
     pub origin: String,
-    /// Its keys.
+    /// Its keys, but for those of `variants` and `axes`.
     pub table: Table,
+    /// `experiment.variant`, if the layer has it.
+    pub variants: Option<Value>,
+    /// `experiment.axes`, if the layer has it.
+    pub axes: Option<Value>,
 }
 
 impl Layer {
-    pub fn default_layer() -> Layer {
-        Layer::parse("configs/default.toml", DEFAULT).expect("the embedded default is valid TOML")
+    pub fn new(origin: &str, mut table: Table) -> Layer {
+        let mut taken = |key| match table.get_mut("experiment") {
+            Some(Value::Table(experiment)) => experiment.remove(key),
+            _ => None,
+        };
+        let (variants, axes) = (taken("variant"), taken("axes"));
+        Layer { origin: origin.to_owned(), table, variants, axes }
     }
 
-    pub fn read(path: &Path) -> Result<Layer, ConfigError> {
-        let text = read_text(path)
-            .map_err(|source| ConfigError::Read { path: path.to_owned(), source })?;
-        Layer::parse(&path.display().to_string(), &text)
+    /// The default configuration.
+    pub fn default_of(catalogue: &Catalogue) -> Layer {
+        Layer::new("the default", catalogue.schema().table.clone())
     }
 
-    fn parse(origin: &str, text: &str) -> Result<Layer, ConfigError> {
-        let table = text.parse::<Table>().map_err(|error| {
-            let start = error.span().map_or(0, |span| span.start);
-            let line = 1 + text[..start.min(text.len())].matches('\n').count();
-            let message = format!("line {line}: {}", one_line(error.message()));
-            ConfigError::Syntax { origin: origin.to_owned(), message }
-        })?;
-        Ok(Layer { origin: origin.to_owned(), table })
+    /// Refuses keys that the schema does not have, values of another type and values out of range.
+    pub fn check(&self, schema: &Schema) -> Result<(), ConfigError> {
+        leaves(&self.table)
+            .iter()
+            .try_for_each(|(key, value)| schema.check(key, value, &self.origin))
     }
+}
 
-    /// Refuses keys that the schema has not, values of another type and values out of range.
-    pub fn check(&self, schema: &Table) -> Result<(), ConfigError> {
-        let known = known_keys(schema);
-        for (key, value) in leaves(&self.table) {
-            match lookup(schema, &key) {
-                None => {
-                    return Err(ConfigError::UnknownKey {
-                        advice: advice(&key, &known),
-                        key,
-                        origin: self.origin.clone(),
-                    });
-                }
-                Some(example) => rules::check(&key, &value, example, &self.origin)?,
+/// A TOML file.
+pub(super) fn read(path: &Path) -> Result<(String, Table), ConfigError> {
+    let text =
+        read_text(path).map_err(|source| ConfigError::Read { path: path.to_owned(), source })?;
+    let origin = path.display().to_string();
+    let table = table(&origin, &text)?;
+    Ok((origin, table))
+}
+
+/// A text as TOML.
+pub(super) fn table(origin: &str, text: &str) -> Result<Table, ConfigError> {
+    text.parse::<Table>().map_err(|error| {
+        let start = error.span().map_or(0, |span| span.start);
+        let line = 1 + text[..start.min(text.len())].matches('\n').count();
+        let message = format!("line {line}: {}", one_line(error.message()));
+        ConfigError::Syntax { origin: origin.to_owned(), message }
+    })
+}
+
+/// A text as a layer.
+pub(super) fn parse(origin: &str, text: &str) -> Result<Layer, ConfigError> {
+    Ok(Layer::new(origin, table(origin, text)?))
+}
+
+/// The most files that extend one another.
+const MOST_FILES: usize = 16;
+
+/// A configuration file after the files that it extends.
+pub(super) fn read_files(path: &Path) -> Result<Vec<Layer>, ConfigError> {
+    let mut layers = Vec::new();
+    let mut read_paths: Vec<PathBuf> = Vec::new();
+    let mut next = Some(path.to_owned());
+    while let Some(path) = next {
+        let (origin, mut table) = read(&path)?;
+        let extends = |what: String| ConfigError::Extends { origin: origin.clone(), what };
+        next = match table.remove("extends") {
+            None => None,
+            Some(Value::String(base)) => Some(path.parent().unwrap_or(Path::new("")).join(base)),
+            Some(value) => {
+                return Err(extends(format!(
+                    "{} is no path of a file",
+                    one_line(&value.to_string())
+                )));
             }
+        };
+        // One file may be reached by several paths.
+        let real = path.canonicalize().unwrap_or(path);
+        if read_paths.contains(&real) {
+            return Err(extends("the files extend one another in a circle".to_owned()));
         }
-        Ok(())
+        read_paths.push(real);
+        if read_paths.len() > MOST_FILES {
+            return Err(extends(format!("more than {MOST_FILES} files extend one another")));
+        }
+        layers.push(Layer::new(&origin, table));
     }
+    layers.reverse();
+    Ok(layers)
 }
 
 /// More parts than any key has.
 const DEEPEST: usize = 16;
 
-/// One `key=value` from the command line.
+/// One `key=value`: from the command line, or from a variant of the experiment.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Setting {
     origin: String,
@@ -66,24 +116,20 @@ pub struct Setting {
 }
 
 impl Setting {
-    /// Parses the text behind `--set`: the value is TOML, and a string if it is not.
+    /// Parses the text after `--set`: the value is TOML, and a string if it is not.
     ///
     /// # Errors
     /// If there is no `=` or no key before it.
     pub fn parse(text: &str) -> Result<Setting, ConfigError> {
         let refused = || ConfigError::Setting { setting: text.to_owned() };
         let (key, value) = text.split_once('=').ok_or_else(refused)?;
-        let key: Vec<String> = key.split('.').map(|part| part.trim().to_owned()).collect();
-        // No key is nested as deeply; reading one by one goes as deep as it is.
-        if key.len() > DEEPEST || key.iter().any(String::is_empty) {
-            return Err(refused());
-        }
+        let key = parts(key).ok_or_else(refused)?;
         let value =
             value.trim().parse::<Value>().unwrap_or_else(|_| Value::String(value.to_owned()));
         Ok(Setting { origin: "--set".to_owned(), key, value })
     }
 
-    /// What an option of the command line stands for, such as `--steps` for `train.steps`.
+    /// The setting of an option of the command line, such as `--steps` for `train.steps`.
     pub fn option(option: &str, key: &str, value: impl Into<Value>) -> Setting {
         Setting {
             origin: option.to_owned(),
@@ -92,67 +138,65 @@ impl Setting {
         }
     }
 
-    /// Whether the key is `env.KEY` with KEY no world's: it then means each selected world.
-    pub(super) fn is_shorthand(&self) -> bool {
-        self.key.len() > 1
-            && self.key[0] == "env"
-            && WorldName::ALL.iter().all(|world| world.as_str() != self.key[1])
+    /// A setting of a variant; `None` if the key has no parts or too many.
+    pub(super) fn of_variant(origin: &str, key: &str, value: Value) -> Option<Setting> {
+        Some(Setting { origin: origin.to_owned(), key: parts(key)?, value })
     }
 
-    pub(super) fn layer(&self) -> Layer {
-        Layer { origin: self.origin.clone(), table: nested(&self.key, self.value.clone()) }
+    /// The dotted key.
+    pub(super) fn key(&self) -> String {
+        self.key.join(".")
     }
 
-    /// The layer that a shorthand stands for.
-    pub(super) fn expanded(
+    /// Whether the key is `env.KEY` and KEY is not a world's: it then means each selected world.
+    fn is_shorthand(&self, schema: &Schema) -> bool {
+        self.key.len() > 1 && self.key[0] == "env" && !schema.has_world(&self.key[1])
+    }
+
+    /// The layer of the setting, if it needs no list of worlds.
+    pub(super) fn plain(&self, schema: &Schema) -> Option<Layer> {
+        (!self.is_shorthand(schema))
+            .then(|| Layer::new(&self.origin, nested(&self.key, self.value.clone())))
+    }
+
+    /// The layer of the setting, with `env.KEY` for each of the worlds that has it.
+    pub(super) fn layer(
         &self,
         worlds: &[WorldName],
-        schema: &Table,
+        schema: &Schema,
     ) -> Result<Layer, ConfigError> {
+        if let Some(layer) = self.plain(schema) {
+            return Ok(layer);
+        }
         let mut table = Table::new();
         for world in worlds {
             let mut key = self.key.clone();
             key.insert(1, world.to_string());
-            if lookup(schema, &key.join(".")).is_some() {
+            if schema.lookup(&key.join(".")).is_some() {
                 merge(&mut table, &nested(&key, self.value.clone()));
             }
         }
         if table.is_empty() {
-            let known = known_keys(schema);
-            let names: Vec<&str> = worlds.iter().map(|world| world.as_str()).collect();
-            let key = self.key.join(".");
+            let names: Vec<&str> = worlds.iter().map(WorldName::as_str).collect();
+            let key = self.key();
             return Err(ConfigError::UnknownKey {
                 advice: format!(
                     "no selected world ({}) has it; {}",
                     names.join(", "),
-                    advice(&key, &known)
+                    schema.advice(&key)
                 ),
                 key,
                 origin: self.origin.clone(),
             });
         }
-        Ok(Layer { origin: self.origin.clone(), table })
+        Ok(Layer::new(&self.origin, table))
     }
 }
 
-fn nested(key: &[String], value: Value) -> Table {
-    let (last, path) = key.split_last().expect("a setting has a key");
-    let leaf = Table::from_iter([(last.clone(), value)]);
-    path.iter()
-        .rev()
-        .fold(leaf, |inner, part| Table::from_iter([(part.clone(), Value::Table(inner))]))
-}
-
-/// Writes `over` over `base`, table by table.
-fn merge(base: &mut Table, over: &Table) {
-    for (key, value) in over {
-        match (base.get_mut(key), value) {
-            (Some(Value::Table(base)), Value::Table(over)) => merge(base, over),
-            _ => {
-                base.insert(key.clone(), value.clone());
-            }
-        }
-    }
+/// The parts of a dotted key; `None` if one is empty or there are more than [`DEEPEST`].
+fn parts(key: &str) -> Option<Vec<String>> {
+    let parts: Vec<String> = key.split('.').map(|part| part.trim().to_owned()).collect();
+    (parts.len() <= DEEPEST && !parts.iter().any(String::is_empty)).then_some(parts)
 }
 
 /// All layers, the later ones over the earlier ones.
@@ -165,7 +209,7 @@ pub(super) fn merged(stack: &[Layer]) -> Table {
 }
 
 /// The training options of a world: per layer `[train]`, then the world's own `[env.WORLD.train]`.
-pub(super) fn merged_train(stack: &[Layer], world: WorldName) -> Table {
+pub(super) fn merged_train(stack: &[Layer], world: &str) -> Table {
     let mut train = Table::new();
     for layer in stack {
         let own = format!("env.{world}.train");
@@ -179,76 +223,11 @@ pub(super) fn merged_train(stack: &[Layer], world: WorldName) -> Table {
 }
 
 /// The constants of a world.
-pub(super) fn constants(merged: &Table, world: WorldName) -> Table {
+pub(super) fn constants(merged: &Table, world: &str) -> Table {
     let mut table = match at(merged, &format!("env.{world}")) {
         Some(Value::Table(table)) => table.clone(),
         _ => Table::new(),
     };
     table.remove("train");
     table
-}
-
-/// All values that are no tables, with their dotted keys. An empty table counts as a value, so that
-/// an unknown empty section is found too.
-pub(super) fn leaves(table: &Table) -> Vec<(String, Value)> {
-    let mut found = Vec::new();
-    for (key, value) in table {
-        match value {
-            Value::Table(inner) if !inner.is_empty() => {
-                let inner = leaves(inner).into_iter();
-                found.extend(inner.map(|(rest, value)| (format!("{key}.{rest}"), value)));
-            }
-            _ => found.push((key.clone(), value.clone())),
-        }
-    }
-    found
-}
-
-fn at<'a>(table: &'a Table, key: &str) -> Option<&'a Value> {
-    match key.split_once('.') {
-        None => table.get(key),
-        Some((first, rest)) => match table.get(first) {
-            Some(Value::Table(inner)) => at(inner, rest),
-            _ => None,
-        },
-    }
-}
-
-/// The default's value of a key; a world's own `train` section has the keys of `[train]`.
-fn lookup<'a>(schema: &'a Table, key: &str) -> Option<&'a Value> {
-    at(schema, canonical(key))
-}
-
-/// `train.KEY` for `env.WORLD.train.KEY`, and any other key itself.
-pub(super) fn canonical(key: &str) -> &str {
-    let own = key.strip_prefix("env.").and_then(|rest| rest.split_once('.'));
-    match own {
-        Some((world, rest)) if rest == "train" || rest.starts_with("train.") => {
-            if world.parse::<WorldName>().is_ok() { rest } else { key }
-        }
-        _ => key,
-    }
-}
-
-fn known_keys(schema: &Table) -> Vec<String> {
-    let mut keys: Vec<String> =
-        leaves(schema).into_iter().map(|(key, _)| canonical(&key).to_owned()).collect();
-    keys.sort();
-    keys.dedup();
-    keys
-}
-
-/// The nearest known key by edit distance of the last part, then of the whole.
-fn advice(key: &str, known: &[String]) -> String {
-    let last = |key: &str| key.rsplit('.').next().unwrap_or_default().to_owned();
-    let distance = |candidate: &String| {
-        (strsim::osa_distance(&last(key), &last(candidate)), strsim::osa_distance(key, candidate))
-    };
-    let nearest = known.iter().min_by_key(|candidate| distance(candidate));
-    match nearest {
-        Some(nearest) if distance(nearest).0 <= 1 + last(key).len() / 4 => {
-            format!("did you mean {nearest}?")
-        }
-        _ => "`cvar-game config` lists all keys".to_owned(),
-    }
 }

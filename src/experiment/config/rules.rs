@@ -1,187 +1,116 @@
-//! What each value may be.
+//! What each value may be: the rules, as the last comment line above a key states them.
 //!
-//! The type follows from the default's value; the range of every number is in [`RULES`], apart from
-//! the constants of the worlds, which know their ranges themselves.
+//! ```toml
+//! # Range: [1, 1000]               an interval; ( and ) leave a bound out, inf is no bound
+//! # One of: "chosen", "executed"   these words; "cuda:N" allows any whole number N
+//! ```
+//!
+//! Without such a line, the type of the default's value is the rule. Whether a range is one of whole
+//! numbers follows from that type too. The rule of a list is that of its elements.
 
-use super::layers::{canonical, leaves};
-use super::{ConfigError, Device, WorldName};
-use crate::game::gaussian::MAX_BUMPS;
+use super::{ConfigError, one_line};
 use std::ops::Bound::{self, Excluded, Included, Unbounded};
-use toml::{Table, Value};
+use std::ops::RangeBounds;
+use toml::Value;
 
-/// The worlds, as a value may name them.
-pub(super) const WORLDS: [&str; 2] = [WorldName::ALL[0].as_str(), WorldName::ALL[1].as_str()];
-
-/// The devices, in words.
-pub(super) const DEVICE: &str = "\"cpu\", \"cuda\" or \"cuda:N\"";
-
-enum Rule {
+/// What a value, or each element of a list, may be.
+#[derive(Debug, Clone, PartialEq)]
+pub(super) enum Rule {
     /// A whole number within the bounds, both included.
     Whole(i64, i64),
     /// A finite number within the bounds.
     Number(Bound<f64>, Bound<f64>),
     /// One of these words.
-    Word(&'static [&'static str]),
-    /// A [`Device`].
-    Device,
+    Word(Vec<String>),
+    /// Any text.
+    Text,
     /// True or false.
     Flag,
-}
-
-use Rule::{Flag, Number, Whole, Word};
-
-const POSITIVE: Rule = Number(Excluded(0.0), Unbounded);
-const NOT_NEGATIVE: Rule = Number(Included(0.0), Unbounded);
-const SHARE: Rule = Number(Included(0.0), Included(1.0));
-const COUNT: Rule = Whole(1, i64::MAX);
-/// Sizes of what is held in memory: a typing error should be refused, not fill the memory.
-const SIZE: Rule = Whole(1, 1_000_000);
-
-const CONSTANT_COUNT: Rule = Whole(0, u32::MAX as i64);
-
-/// The rule of each key; of a list, that of its elements. `PLAYER` stands for both players.
-const RULES: &[(&str, Rule)] = &[
-    ("eta", Number(Included(1.0), Unbounded)),
-    ("seed", Whole(0, i64::MAX)),
-    ("gamma", Number(Excluded(0.0), Included(1.0))),
-    ("device", Rule::Device),
-    ("experiment.envs", Word(&WORLDS)),
-    ("experiment.etas", Number(Included(1.0), Unbounded)),
-    ("experiment.seeds", Whole(0, i64::MAX)),
-    ("train.steps", COUNT),
-    ("train.parallel_episodes", SIZE),
-    ("train.rollout_steps", SIZE),
-    ("train.follower_updates", Whole(1, 1_000)),
-    ("train.leader", Word(&["protagonist", "antagonist"])),
-    ("train.credit", Word(&["chosen", "executed"])),
-    ("train.budget_wait", Number(Included(0.0), Excluded(1.0))),
-    ("train.budget_rise", SHARE),
-    ("train.response", SHARE),
-    ("train.adversary", Word(&["learned", "random"])),
-    ("train.hide_budget", Flag),
-    ("train.price_budget", Flag),
-    ("train.initial_std", POSITIVE),
-    ("train.PLAYER.hidden", Whole(1, 65_536)),
-    ("train.PLAYER.time_aware", Flag),
-    ("train.PLAYER.learning_rate", POSITIVE),
-    ("train.PLAYER.learning_rate_final", NOT_NEGATIVE),
-    ("train.PLAYER.epochs", Whole(1, 1_000)),
-    ("train.PLAYER.minibatch", COUNT),
-    ("train.PLAYER.clip", Number(Excluded(0.0), Excluded(1.0))),
-    ("train.PLAYER.gae_lambda", SHARE),
-    ("train.PLAYER.entropy", NOT_NEGATIVE),
-    ("train.PLAYER.entropy_final", NOT_NEGATIVE),
-    ("train.PLAYER.value_coefficient", NOT_NEGATIVE),
-    ("train.PLAYER.gradient_norm", POSITIVE),
-    ("train.bump.count", Whole(1, MAX_BUMPS as i64)),
-    ("train.bump.center", Number(Excluded(0.0), Included(100.0))),
-    ("train.bump.curvature", Number(Excluded(0.0), Included(1e6))),
-    ("checkpoint.every", COUNT),
-    ("evaluation.episodes", Whole(1, 100_000_000)),
-    ("evaluation.exhibit_episodes", Whole(1, 100_000_000)),
-    ("evaluation.oracle", Word(&["shipped", "computed"])),
-    ("evaluation.parallel_episodes", SIZE),
-    ("evaluation.seed", Whole(0, i64::MAX)),
-    ("evaluation.alphas", Number(Excluded(0.0), Included(1.0))),
-];
-
-fn rule(key: &str) -> Option<&'static Rule> {
-    let player = ["train.protagonist.", "train.antagonist."];
-    let key = canonical(key);
-    let name = match player.iter().find_map(|prefix| key.strip_prefix(prefix)) {
-        Some(rest) => format!("train.PLAYER.{rest}"),
-        None => key.to_owned(),
-    };
-    RULES.iter().find(|(key, _)| *key == name).map(|(_, rule)| rule)
-}
-
-/// Refuses a value of another type than the default's `example`, and one out of range.
-pub(super) fn check(
-    key: &str,
-    value: &Value,
-    example: &Value,
-    origin: &str,
-) -> Result<(), ConfigError> {
-    if alike(value, example) {
-        return match (rule(key), value, example) {
-            // Constants of the worlds: lists are points, whole numbers are counts.
-            (None, Value::Array(values), Value::Array(point)) if values.len() != point.len() => {
-                let allowed = format!("a list of {} numbers, such as {example}", point.len());
-                Err(refused(key, value, origin, allowed))
-            }
-            (None, Value::Integer(_), Value::Integer(_)) if !CONSTANT_COUNT.admits(value) => {
-                Err(refused(key, value, origin, CONSTANT_COUNT.allowed()))
-            }
-            _ => check_range(key, value, origin),
-        };
-    }
-    let allowed = match example {
-        Value::Array(_) => format!("a list, such as {example}"),
-        Value::Table(_) => format!("a section; set its keys, such as {key}.{}", first_key(example)),
-        _ => rule(key).map_or_else(|| kind(example).to_owned(), Rule::allowed),
-    };
-    Err(refused(key, value, origin, allowed))
-}
-
-/// Refuses every value of the table that is out of range.
-pub(super) fn check_all(table: &Table, origin: &str) -> Result<(), ConfigError> {
-    leaves(table).iter().try_for_each(|(key, value)| check_range(key, value, origin))
-}
-
-fn check_range(key: &str, value: &Value, origin: &str) -> Result<(), ConfigError> {
-    let Some(rule) = rule(key) else {
-        return match value {
-            Value::Float(number) if !number.is_finite() => {
-                Err(refused(key, value, origin, "a finite number".into()))
-            }
-            _ => Ok(()),
-        };
-    };
-    let Value::Array(elements) = value else {
-        return if rule.admits(value) {
-            Ok(())
-        } else {
-            Err(refused(key, value, origin, rule.allowed()))
-        };
-    };
-    if elements.is_empty() {
-        return Err(refused(key, value, origin, "a list of at least one value".into()));
-    }
-    for (index, element) in elements.iter().enumerate() {
-        if !rule.admits(element) {
-            let allowed = format!("a list, each element {}", rule.allowed());
-            return Err(refused(key, value, origin, allowed));
-        }
-        if elements[..index].iter().any(|earlier| equal(earlier, element)) {
-            let allowed = format!("without duplicates ({} is there twice)", shown(element));
-            return Err(refused(key, value, origin, allowed));
-        }
-    }
-    Ok(())
+    /// Checked elsewhere.
+    Free,
 }
 
 impl Rule {
+    /// The rule that the last comment line above a key states, or that follows from the key's
+    /// default.
+    ///
+    /// # Errors
+    /// If the line is not a rule, or does not fit the default.
+    pub fn read(comment: Option<&str>, default: &Value) -> Result<Rule, String> {
+        let example = element(default);
+        if let Some(range) = stated(comment, "Range:") {
+            let bounds = interval(range).ok_or_else(|| format!("{range:?} is no interval"))?;
+            return match example {
+                Value::Integer(_) => whole(bounds),
+                Value::Float(_) => Ok(Rule::Number(bounds.0, bounds.1)),
+                _ => Err(format!("{default} has no range")),
+            };
+        }
+        if let Some(words) = stated(comment, "One of:") {
+            let unquoted = |word: &str| {
+                let word = word.trim().strip_prefix('"')?.strip_suffix('"')?;
+                (!word.contains(['"', '\\'])).then(|| word.to_owned())
+            };
+            let words: Option<Vec<String>> = words.split(',').map(unquoted).collect();
+            let words = words.filter(|_| matches!(example, Value::String(_)));
+            return words.map(Rule::Word).ok_or_else(|| format!("{default} has no such choice"));
+        }
+        Ok(match example {
+            Value::Integer(_) => Rule::Whole(i64::MIN, i64::MAX),
+            Value::Float(_) => Rule::Number(Unbounded, Unbounded),
+            Value::String(_) => Rule::Text,
+            Value::Boolean(_) => Rule::Flag,
+            _ => Rule::Free,
+        })
+    }
+
+    /// Whether the comment line states a rule.
+    pub fn is_stated(comment: &str) -> bool {
+        ["Range:", "One of:"].iter().any(|word| stated(Some(comment), word).is_some())
+    }
+
+    /// Refuses a value, or a list with an element, that breaks the rule.
+    pub fn check(&self, key: &str, value: &Value, origin: &str) -> Result<(), ConfigError> {
+        match value {
+            Value::Array(elements) if *self != Rule::Free => {
+                if elements.iter().all(|element| self.admits(element)) {
+                    return Ok(());
+                }
+                let allowed = format!("a list, each element {}", self.allowed());
+                Err(refused(key, value, origin, allowed))
+            }
+            _ if self.admits(value) => Ok(()),
+            _ => Err(refused(key, value, origin, self.allowed())),
+        }
+    }
+
     fn admits(&self, value: &Value) -> bool {
         match (self, value) {
-            (Whole(least, most), Value::Integer(value)) => (least..=most).contains(&value),
-            (Number(from, to), Value::Integer(_) | Value::Float(_)) => {
-                number(value).is_some_and(|value| {
-                    value.is_finite() && std::ops::RangeBounds::contains(&(*from, *to), &value)
+            (Rule::Free, _) => true,
+            (Rule::Whole(least, most), Value::Integer(value)) => (least..=most).contains(&value),
+            (Rule::Number(from, to), Value::Integer(_) | Value::Float(_)) => number(value)
+                .is_some_and(|value| value.is_finite() && (*from, *to).contains(&value)),
+            (Rule::Word(words), Value::String(word)) => {
+                words.iter().any(|known| match known.strip_suffix(":N") {
+                    Some(name) => word
+                        .strip_prefix(name)
+                        .and_then(|rest| rest.strip_prefix(':'))
+                        .is_some_and(|number| number.parse::<usize>().is_ok()),
+                    None => known == word,
                 })
             }
-            (Word(words), Value::String(word)) => words.contains(&word.as_str()),
-            (Rule::Device, Value::String(device)) => device.parse::<Device>().is_ok(),
-            (Flag, Value::Boolean(_)) => true,
+            (Rule::Text, Value::String(_)) | (Rule::Flag, Value::Boolean(_)) => true,
             _ => false,
         }
     }
 
     /// What is allowed, in words.
-    fn allowed(&self) -> String {
+    pub fn allowed(&self) -> String {
         match self {
-            Whole(least, i64::MAX) => format!("a whole number of at least {least}"),
-            Whole(least, most) => format!("a whole number from {least} to {most}"),
-            Number(from, to) => {
+            Rule::Whole(i64::MIN, i64::MAX) => "a whole number".to_owned(),
+            Rule::Whole(least, i64::MAX) => format!("a whole number of at least {least}"),
+            Rule::Whole(least, most) => format!("a whole number from {least} to {most}"),
+            Rule::Number(from, to) => {
                 let lower = match from {
                     Included(bound) => Some(format!("at least {bound}")),
                     Excluded(bound) => Some(format!("above {bound}")),
@@ -193,20 +122,95 @@ impl Rule {
                     Unbounded => None,
                 };
                 let bounds: Vec<String> = lower.into_iter().chain(upper).collect();
-                format!("a finite number {}", bounds.join(" and "))
+                format!("a finite number {}", bounds.join(" and ")).trim_end().to_owned()
             }
-            Word(words) => {
+            Rule::Word(words) => {
                 let quoted: Vec<String> = words.iter().map(|word| format!("{word:?}")).collect();
-                quoted.join(" or ")
+                match quoted.split_last() {
+                    Some((last, rest)) if !rest.is_empty() => {
+                        format!("{} or {last}", rest.join(", "))
+                    }
+                    _ => quoted.concat(),
+                }
             }
-            Rule::Device => DEVICE.to_owned(),
-            Flag => "true or false".to_owned(),
+            Rule::Text => "a text".to_owned(),
+            Rule::Flag => "true or false".to_owned(),
+            Rule::Free => "a value as in `cvar-game config --default`".to_owned(),
         }
     }
 }
 
-/// Whether the types agree; a whole number may stand where any number may.
-fn alike(value: &Value, example: &Value) -> bool {
+/// The rest of a comment line that begins with the word.
+fn stated<'a>(comment: Option<&'a str>, word: &str) -> Option<&'a str> {
+    comment?.trim_start_matches('#').trim().strip_prefix(word).map(str::trim)
+}
+
+/// An interval such as `[1, 1000]` or `(0, inf)`.
+fn interval(text: &str) -> Option<(Bound<f64>, Bound<f64>)> {
+    let (lower, upper) = text.split_once(',')?;
+    let bound = |text: &str, included: bool| {
+        let bound: f64 = text.trim().parse().ok().filter(|bound: &f64| !bound.is_nan())?;
+        Some(match (bound.is_infinite(), included) {
+            (true, true) => return None,
+            (true, false) => Unbounded,
+            (false, true) => Included(bound),
+            (false, false) => Excluded(bound),
+        })
+    };
+    let end = |text: &str, brackets: [char; 2]| {
+        let included = text.contains(brackets[0]);
+        (included != text.contains(brackets[1]))
+            .then(|| bound(text.trim_matches(&brackets[..]), included))
+            .flatten()
+    };
+    Some((end(lower.trim(), ['[', '('])?, end(upper.trim(), [']', ')'])?))
+}
+
+/// The whole numbers within the bounds.
+fn whole((from, to): (Bound<f64>, Bound<f64>)) -> Result<Rule, String> {
+    let exact = |bound: f64| {
+        // Beyond 2^53 a bound could not be read exactly.
+        let exact = bound.fract() == 0.0 && bound.abs() <= 9_007_199_254_740_992.0;
+        exact.then_some(bound as i64).ok_or_else(|| format!("{bound} is no bound of whole numbers"))
+    };
+    let least = match from {
+        Included(bound) => exact(bound)?,
+        Excluded(bound) => exact(bound)? + 1,
+        Unbounded => i64::MIN,
+    };
+    let most = match to {
+        Included(bound) => exact(bound)?,
+        Excluded(bound) => exact(bound)? - 1,
+        Unbounded => i64::MAX,
+    };
+    Ok(Rule::Whole(least, most))
+}
+
+/// The first element of a list, and any other value itself.
+fn element(value: &Value) -> &Value {
+    match value {
+        Value::Array(elements) => elements.first().map_or(value, element),
+        _ => value,
+    }
+}
+
+/// Refuses an empty list, and one with the same element twice.
+pub(super) fn check_set(key: &str, value: &Value, origin: &str) -> Result<(), ConfigError> {
+    let Value::Array(elements) = value else { return Ok(()) };
+    if elements.is_empty() {
+        return Err(refused(key, value, origin, "a list of at least one value".into()));
+    }
+    for (index, element) in elements.iter().enumerate() {
+        if elements[..index].iter().any(|earlier| equal(earlier, element)) {
+            let allowed = format!("without duplicates ({} is there twice)", shown(element));
+            return Err(refused(key, value, origin, allowed));
+        }
+    }
+    Ok(())
+}
+
+/// Whether the types agree; a whole number is allowed where any number is.
+pub(super) fn alike(value: &Value, example: &Value) -> bool {
     match (value, example) {
         (Value::Integer(_), Value::Float(_)) => true,
         (Value::Array(values), Value::Array(examples)) => {
@@ -232,29 +236,15 @@ fn number(value: &Value) -> Option<f64> {
     }
 }
 
-fn kind(example: &Value) -> &'static str {
-    match example {
-        Value::Integer(_) => "a whole number",
-        Value::Float(_) => "a finite number",
-        Value::Boolean(_) => "true or false",
-        Value::String(_) => "a text",
-        _ => "a value as in configs/default.toml",
-    }
-}
-
-fn first_key(section: &Value) -> &str {
-    section.as_table().and_then(|table| table.keys().next()).map_or("", String::as_str)
-}
-
 /// A value on one line.
 pub(super) fn shown(value: &Value) -> String {
     match value {
         Value::String(text) => format!("{text:?}"),
-        _ => super::one_line(&value.to_string()),
+        _ => one_line(&value.to_string()),
     }
 }
 
-fn refused(key: &str, value: &Value, origin: &str, allowed: String) -> ConfigError {
+pub(super) fn refused(key: &str, value: &Value, origin: &str, allowed: String) -> ConfigError {
     ConfigError::Value {
         key: key.to_owned(),
         value: shown(value),
@@ -268,26 +258,24 @@ mod tests {
     use super::*;
 
     #[test]
-    fn every_number_of_the_default_has_a_range() {
-        let default: Table = super::super::DEFAULT.parse().unwrap();
-        for (key, _) in leaves(&default) {
-            if key.starts_with("env.") && canonical(&key).starts_with("env.")
-                || key.ends_with(".train")
-            {
-                continue; // the worlds check their constants; a world may have no options of its own
-            }
-            assert!(rule(&key).is_some(), "{key} has no rule");
+    fn rules_are_read_from_comments() {
+        let (one, half) = (Value::Integer(1), Value::Float(0.5));
+        let read = |line: &str, default: &Value| Rule::read(Some(line), default);
+        assert_eq!(read("# Range: [1, 1000]", &one), Ok(Rule::Whole(1, 1000)));
+        assert_eq!(read("# Range: (0, inf)", &one), Ok(Rule::Whole(1, i64::MAX)));
+        assert_eq!(read("# Range: (0, 1]", &half), Ok(Rule::Number(Excluded(0.0), Included(1.0))));
+        assert_eq!(read("# Range: (-inf, inf)", &half), Ok(Rule::Number(Unbounded, Unbounded)));
+        let list = Value::Array(vec![half.clone()]);
+        assert_eq!(read("# Range: [0, inf)", &list), Ok(Rule::Number(Included(0.0), Unbounded)));
+        let words = read("# One of: \"a\", \"b:N\"", &Value::String("a".into())).unwrap();
+        assert!(words.admits(&Value::String("b:7".into())));
+        assert!(!words.admits(&Value::String("b:".into())));
+        assert_eq!(words.allowed(), "\"a\" or \"b:N\"");
+        for refused in ["[1, 2", "1, 2", "[1; 2]", "[nan, 1]", "[0, inf]", "[0.5, 1]", "[(0, 1]"] {
+            let read = read(&format!("# Range: {refused}"), &one);
+            assert!(read.is_err(), "{refused} was read as {read:?}");
         }
-    }
-
-    #[test]
-    fn every_rule_is_of_a_key() {
-        let default: Table = super::super::DEFAULT.parse().unwrap();
-        let known: Vec<String> = leaves(&default).into_iter().map(|(key, _)| key).collect();
-        for (key, _) in RULES {
-            let key = key.replace("PLAYER", "protagonist");
-            let of_a_run = ["eta", "seed"].contains(&key.as_str());
-            assert!(of_a_run || known.contains(&key), "{key} is no key");
-        }
+        assert!(read("# One of: a, b", &Value::String("a".into())).is_err());
+        assert!(read("# One of: \"a\"", &one).is_err());
     }
 }

@@ -1,13 +1,13 @@
-//! Workers: one process per run, so that a crash is one run's own, with one torch thread, so that the
+//! Workers: one process per run, so that a crash ends only one run, with one thread, so that the
 //! numbers do not depend on how many run at once.
 //!
 //! A worker reads the `config.toml` of its folder and reports on standard output, one JSON object a
-//! line: `{"steps":..,"mean_return":..}`, `{"note":".."}`, or `{"failure":".."}` before it ends in vain.
-//! Its standard input says nothing and closes when the parent wants it to stop or dies, however it
-//! dies; the worker then ends with a checkpoint.
+//! line: `{"steps":..,"mean_return":..}`, `{"note":".."}`, or `{"failure":".."}` before it fails.
+//! Its standard input is empty. It closes when the parent stops the worker, or when the parent ends for
+//! whatever reason; the worker then writes a checkpoint and ends.
 
 use super::{Failure, LOG, Launcher, Report, Stop, Tick};
-use crate::experiment::config::RunConfig;
+use crate::experiment::config::{Catalogue, RunConfig};
 use crate::experiment::stop::{RESUME, exit_code};
 use serde::{Deserialize, Serialize};
 use signal_hook::consts::SIGTERM;
@@ -43,14 +43,14 @@ pub struct Workers {
     patience: Duration,
 }
 
-/// How long a worker may take over its checkpoint: Slurm kills 30 s after it asks to stop.
+/// How long a worker may take over its checkpoint: Slurm kills 30 s after its request to stop.
 const PATIENCE: Duration = Duration::from_secs(25);
 
 impl Workers {
     /// Workers that run this program again, as `worker --folder DIR`.
     ///
     /// # Errors
-    /// If the system does not tell the program's path.
+    /// If the system does not provide the program's path.
     pub fn of_this_program() -> io::Result<Self> {
         Ok(Workers::of(std::env::current_exe()?))
     }
@@ -60,7 +60,7 @@ impl Workers {
         Workers { program, patience: PATIENCE }
     }
 
-    /// The same, killing a worker that does not end so long after it was asked to.
+    /// The same, but kills a worker that has not ended this long after the request to stop.
     pub fn with_patience(self, patience: Duration) -> Self {
         Workers { patience, ..self }
     }
@@ -74,8 +74,8 @@ impl Workers {
             .stdin(Stdio::piped())
             .stdout(Stdio::piped())
             .stderr(File::create(folder.join(LOG))?);
-        // A group of its own: Ctrl-C on the terminal reaches the parent alone, which then stops its
-        // workers; a worker that died first would look like a failed run.
+        // A group of its own: Ctrl-C on the terminal reaches only the parent, which then stops its
+        // workers; a worker that the signal ended would look like a failed run.
         #[cfg(unix)]
         std::os::unix::process::CommandExt::process_group(&mut command, 0);
         command.spawn()
@@ -140,7 +140,7 @@ impl Launcher for Workers {
     }
 }
 
-/// What is known of a worker that died without a word.
+/// The reason of a worker that ended without a report, as far as it is known.
 fn describe(status: ExitStatus, log: &str, folder: &Path) -> String {
     #[cfg(unix)]
     if let Some(signal) = std::os::unix::process::ExitStatusExt::signal(&status) {
@@ -153,9 +153,9 @@ fn describe(status: ExitStatus, log: &str, folder: &Path) -> String {
     format!("its worker crashed ({status}) and said: {said}; see {}", folder.join(LOG).display())
 }
 
-/// The whole life of a worker process: carries out the run in `folder` and reports on standard output.
+/// The main function of a worker process: carries out the run in `folder` and reports on standard output.
 /// Returns its exit code.
-pub fn work(folder: &Path, carry_out: CarryOut) -> u8 {
+pub fn work(catalogue: &Catalogue, folder: &Path, carry_out: &CarryOut<'_>) -> u8 {
     let stop = match Stop::on_signals() {
         Ok(stop) => stop,
         Err(error) => {
@@ -171,10 +171,10 @@ pub fn work(folder: &Path, carry_out: CarryOut) -> u8 {
     let say = |line: &Line| {
         let line = serde_json::to_string(line).expect("a line is representable as JSON");
         let mut output = io::stdout().lock();
-        // Fails when the parent is gone; the thread above then stops the run.
+        // Fails after the parent has ended; the thread above then stops the run.
         let _ = writeln!(output, "{line}").and_then(|()| output.flush());
     };
-    let result = RunConfig::load(&folder.join("config.toml"))
+    let result = RunConfig::load(&folder.join("config.toml"), catalogue)
         .map_err(|error| Failure::Failed(error.to_string()))
         .and_then(|run| carry_out(&run, folder, &stop, &mut |report| say(&report.into())));
     match result {
@@ -188,13 +188,14 @@ pub fn work(folder: &Path, carry_out: CarryOut) -> u8 {
 }
 
 /// How a run is carried out, as [`Launcher::launch`] says.
-pub type CarryOut = fn(&RunConfig, &Path, &Stop, &mut dyn FnMut(Report)) -> Result<(), Failure>;
+pub type CarryOut<'a> =
+    dyn Fn(&RunConfig, &Path, &Stop, &mut dyn FnMut(Report)) -> Result<(), Failure> + Sync + 'a;
 
 /// Carries out runs in this process.
-#[derive(Debug, Clone, Copy)]
-pub struct InProcess(pub CarryOut);
+#[derive(Clone, Copy)]
+pub struct InProcess<'a>(pub &'a CarryOut<'a>);
 
-impl Launcher for InProcess {
+impl Launcher for InProcess<'_> {
     fn launch(
         &self,
         run: &RunConfig,

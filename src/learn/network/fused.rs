@@ -22,7 +22,7 @@ pub struct Fused {
     by_second: Vec<f32>,
 }
 
-/// tanh, by the rational approximation of degree 13/6 that Eigen and XLA use; a test holds it to 1e-6.
+/// tanh, by the rational approximation of degree 13/6 that Eigen and XLA use; a test checks it to 1e-6.
 #[inline(always)]
 fn tanh<S: Simd>(simd: S, z: S::f32s) -> S::f32s {
     const LIMIT: f32 = 7.905_311; // beyond it tanh is 1 in f32
@@ -49,7 +49,7 @@ fn tanh<S: Simd>(simd: S, z: S::f32s) -> S::f32s {
     simd.div_f32s(simd.mul_f32s(z, p), q)
 }
 
-/// Loads a block of samples, of which the last may have fewer; what is left over is zero.
+/// Loads a block of samples, of which the last may have fewer; the rest is zero.
 fn load(inputs: &[f32], width: usize, x: &mut [f32]) {
     x.fill(0.0);
     for (sample, numbers) in inputs.chunks_exact(width).enumerate() {
@@ -87,7 +87,7 @@ fn hidden_layer<S: Simd>(
 /// A row of V h + b.
 #[inline(always)]
 fn output<S: Simd>(simd: S, weights: &[f32], bias: f32, h: &[f32], y: &mut [f32]) {
-    // Several sums side by side: each waits for its own last addition alone.
+    // Several independent sums: an addition depends only on the previous one of its own sum.
     const SUMS: usize = 4;
     let (h, _) = S::as_simd_f32s(h);
     let (y, _) = S::as_mut_simd_f32s(y);

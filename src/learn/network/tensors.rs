@@ -139,8 +139,8 @@ impl Buffers {
     }
 }
 
-/// tanh(z) = 2 sigmoid(2z) - 1, in place: libtorch's sigmoid is vectorised everywhere, its tanh goes
-/// to a library that is six times slower on some processors. A test holds it to 1e-5.
+/// tanh(z) = 2 sigmoid(2z) - 1, in place: libtorch's sigmoid is vectorised everywhere, its tanh is
+/// that of a library that is six times slower on some processors. A test checks it to 1e-5.
 fn tanh_(mut z: Tensor) -> Tensor {
     let _ = z.g_mul_scalar_(2.0);
     let _ = z.sigmoid_();

@@ -28,14 +28,20 @@ const COLOURS: [RGBColor; 6] = [
     LAVA,
 ];
 
-/// The colour of the eta in this place.
+/// The colour of the row in this place. After the first six they come again, darker and then lighter.
 pub(super) fn colour(place: usize) -> RGBColor {
-    COLOURS[place % COLOURS.len()]
+    let RGBColor(r, g, b) = COLOURS[place % COLOURS.len()];
+    let shade = |side: u8| match place / COLOURS.len() % 3 {
+        0 => side,
+        1 => side / 2,
+        _ => side / 2 + 120,
+    };
+    RGBColor(shade(r), shade(g), shade(b))
 }
 
 /// A magnitude in [0, 1] as a colour: viridis, from dark to bright.
 pub(super) fn heat(share: f64) -> RGBColor {
-    // A share of nothing is none.
+    // 0 of 0 counts as 0.
     ViridisRGB::get_color(if share.is_nan() { 0.0 } else { share.clamp(0.0, 1.0) })
 }
 
@@ -49,8 +55,17 @@ pub(super) fn text(size: u32, colour: RGBColor, h: HPos, v: VPos) -> TextStyle<'
     ("sans-serif", size).into_font().color(&colour).pos(Pos::new(h, v))
 }
 
+/// A drawing.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Picture {
+    /// As SVG.
+    pub svg: String,
+    /// Its width in pixels.
+    pub width: u32,
+}
+
 /// A figure of this size, drawn by `draw`.
-pub(super) fn figure(size: (u32, u32), draw: impl FnOnce(&Area) -> Drawn) -> Option<String> {
+pub(super) fn figure(size: (u32, u32), draw: impl FnOnce(&Area) -> Drawn) -> Option<Picture> {
     let mut svg = String::new();
     {
         let area = SVGBackend::with_string(&mut svg, size).into_drawing_area();
@@ -58,7 +73,7 @@ pub(super) fn figure(size: (u32, u32), draw: impl FnOnce(&Area) -> Drawn) -> Opt
         draw(&area).ok()?;
         area.present().ok()?;
     }
-    Some(svg)
+    Some(Picture { svg, width: size.0 })
 }
 
 /// Axes of a chart.
@@ -70,7 +85,7 @@ pub(super) struct Axes {
 }
 
 /// Whether an axis can hold a number: beyond this there is nothing to be seen, and ticks would be
-/// counted for ever.
+/// counted without end.
 pub(super) fn drawable(value: f64) -> bool {
     value.abs() <= 1e12
 }
@@ -132,19 +147,51 @@ pub(super) fn short(value: f64) -> String {
     if text == "-0" { "0".to_owned() } else { text.to_owned() }
 }
 
-/// A row of words in their colours, as a legend above the panels.
-pub(super) fn legend(area: &Area, words: &[(String, RGBColor)]) -> Drawn {
-    let mut x = 30;
-    for (word, colour) in words {
-        area.draw(&Rectangle::new([(x, 18), (x + 26, 30)], colour.filled()))?;
-        area.draw(&Text::new(
-            word.clone(),
-            (x + 36, 24),
-            text(TEXT, INK, HPos::Left, VPos::Center),
-        ))?;
-        x += 80 + (word.chars().count() as f64 * 0.52 * f64::from(TEXT)) as i32;
+/// Height of a legend of one row.
+const LEGEND: u32 = 46;
+/// Height of every further row.
+const LEGEND_ROW: i32 = 34;
+
+/// Words in their colours above the panels, in as many rows as they need.
+pub(super) struct Legend {
+    words: Vec<(String, RGBColor, (i32, i32))>,
+    /// Height in the canvas's units.
+    pub height: u32,
+}
+
+impl Legend {
+    /// Places the words in a figure of this width.
+    pub(super) fn new(words: Vec<(String, RGBColor)>, width: u32) -> Legend {
+        let (mut x, mut y) = (30, 24);
+        let place = |(word, colour): (String, RGBColor)| {
+            let needed = words_width(&word);
+            if x > 30 && x + 36 + needed > width as i32 {
+                (x, y) = (30, y + LEGEND_ROW);
+            }
+            let at = (x, y);
+            x += 80 + needed;
+            (word, colour, at)
+        };
+        let words = words.into_iter().map(place).collect();
+        Legend { words, height: LEGEND + (y - 24) as u32 }
     }
-    Ok(())
+
+    pub(super) fn draw(&self, area: &Area) -> Drawn {
+        for (word, colour, (x, y)) in &self.words {
+            area.draw(&Rectangle::new([(*x, y - 6), (x + 26, y + 6)], colour.filled()))?;
+            area.draw(&Text::new(
+                word.clone(),
+                (x + 36, *y),
+                text(TEXT, INK, HPos::Left, VPos::Center),
+            ))?;
+        }
+        Ok(())
+    }
+}
+
+/// About the width of words in panels, in the canvas's units.
+pub(super) fn words_width(words: &str) -> i32 {
+    (words.chars().count() as f64 * 0.52 * f64::from(TEXT)) as i32
 }
 
 /// A scale of [`heat`] with its two ends, in a strip of the canvas.

@@ -2,14 +2,13 @@
 
 use super::Panel;
 use super::canvas::{
-    Axes, INK, TEXT, chart, colour, drawable, figure, frame, heat, legend, on, scale, short, span,
-    text,
+    Axes, INK, Legend, Picture, TEXT, chart, colour, drawable, figure, frame, heat, on, scale,
+    short, span, text, words_width,
 };
-use crate::exact::grid::ExactGrid;
-use crate::experiment::exhibits::WorldExhibit;
-use crate::report::archive::Update;
-use crate::report::group::ALPHAS;
-use lava_envs::GridConfig;
+use crate::experiment::figure_data::{BudgetByTime, FigureData, WorldData};
+use crate::game::returns::ReturnLaw;
+use crate::report::group::{ALPHAS, Measures};
+use crate::report::records::{Records, Update};
 use plotters::prelude::*;
 use plotters::style::text_anchor::{HPos, VPos};
 
@@ -48,13 +47,18 @@ fn over_seeds(seeds: &[Vec<(f64, f64)>]) -> Vec<Band> {
         .collect()
 }
 
-/// Bands in one chart, one for each eta.
+/// The points of each seed of a panel.
+fn of_seeds(panel: &Panel, points: impl Fn(&Records) -> Vec<(f64, f64)>) -> Vec<Vec<(f64, f64)>> {
+    panel.seeds.iter().map(|(_, records)| points(records)).collect()
+}
+
+/// Bands in one chart, one for each row.
 fn bands(
     panels: &[Panel],
     bands: &[Vec<Band>],
     (x_title, y_title): (&'static str, &'static str),
     dashed: &[Vec<(f64, f64)>],
-) -> Option<String> {
+) -> Option<Picture> {
     if bands.iter().all(Vec::is_empty) {
         return None;
     }
@@ -63,13 +67,15 @@ fn bands(
     let x = span(all().map(|band| band.x).chain(others().map(|(x, _)| *x)))?;
     let ends = all().flat_map(|band| [band.low, band.high]);
     let y = span(ends.chain(others().map(|(_, y)| *y)))?;
-    figure((1380, 760), |canvas| {
-        let (top, below) = canvas.split_vertically(46);
-        let words: Vec<_> = (panels.iter().enumerate().zip(bands))
-            .filter(|(_, band)| !band.is_empty())
-            .map(|((place, panel), _)| (format!("eta = {}", panel.group.eta), colour(place)))
-            .collect();
-        legend(&top, &words)?;
+    let words: Vec<_> = (panels.iter().enumerate().zip(bands))
+        .filter(|(_, band)| !band.is_empty())
+        .map(|((place, panel), _)| (panel.group.title(), colour(place)))
+        .collect();
+    let (width, height) = (1380, 714);
+    let legend = Legend::new(words, width);
+    figure((width, legend.height + height), |canvas| {
+        let (top, below) = canvas.split_vertically(legend.height);
+        legend.draw(&top)?;
         let mut chart = chart(&below, "", Axes { x, y, x_title, y_title })?;
         for (place, band) in bands.iter().enumerate() {
             let outline = band.iter().map(|band| (band.x, band.high));
@@ -89,24 +95,20 @@ fn bands(
     })
 }
 
-pub(super) fn learning(panels: &[Panel]) -> Option<(String, String)> {
-    let of_panel = |panel: &Panel| {
-        let seeds: Vec<Vec<(f64, f64)>> = (panel.archives.iter())
-            .map(|(_, archive)| {
-                let updates = &archive.progress;
-                let width = updates.len().div_ceil(BINS).max(1);
-                let bin = |bin: &[Update]| {
-                    let returns: Vec<f64> =
-                        bin.iter().map(|of| of.mean_return).filter(|of| of.is_finite()).collect();
-                    let mean = returns.iter().sum::<f64>() / returns.len() as f64;
-                    (bin[bin.len() - 1].steps, mean)
-                };
-                updates.chunks(width).map(bin).collect()
-            })
-            .collect();
-        over_seeds(&seeds)
+pub(super) fn learning(panels: &[Panel]) -> Option<(Picture, String)> {
+    let points = |records: &Records| {
+        let updates = &records.progress;
+        let width = updates.len().div_ceil(BINS).max(1);
+        let bin = |bin: &[Update]| {
+            let returns: Vec<f64> =
+                bin.iter().map(|of| of.mean_return).filter(|of| of.is_finite()).collect();
+            let mean = returns.iter().sum::<f64>() / returns.len() as f64;
+            (bin[bin.len() - 1].steps, mean)
+        };
+        updates.chunks(width).map(bin).collect()
     };
-    let found: Vec<Vec<Band>> = panels.iter().map(of_panel).collect();
+    let found: Vec<Vec<Band>> =
+        panels.iter().map(|panel| over_seeds(&of_seeds(panel, points))).collect();
     let svg = bands(panels, &found, ("environment steps", "return in training"), &[])?;
     let caption = "Mean undiscounted return of the episodes that ended in a rollout, the sampled protagonist \
                    against its antagonist: so at eta above 1 it is not the nominal return, and it falls \
@@ -114,15 +116,11 @@ pub(super) fn learning(panels: &[Panel]) -> Option<(String, String)> {
     Some((svg, caption.to_owned()))
 }
 
-pub(super) fn regret(panels: &[Panel]) -> Option<(String, String)> {
-    let of_panel = |panel: &Panel| {
-        let point = |update: &Update| Some((update.steps, update.regret?));
-        let seeds: Vec<Vec<(f64, f64)>> = (panel.archives.iter())
-            .map(|(_, archive)| archive.progress.iter().filter_map(point).collect())
-            .collect();
-        over_seeds(&seeds)
-    };
-    let found: Vec<Vec<Band>> = panels.iter().map(of_panel).collect();
+pub(super) fn regret(panels: &[Panel]) -> Option<(Picture, String)> {
+    let point = |update: &Update| Some((update.steps, update.regret?));
+    let points = |records: &Records| records.progress.iter().filter_map(point).collect();
+    let found: Vec<Vec<Band>> =
+        panels.iter().map(|panel| over_seeds(&of_seeds(panel, points))).collect();
     let svg = bands(panels, &found, ("environment steps", "regret"), &[])?;
     let caption = "V*(eta) minus the exact CVaR_1/eta of the greedy protagonist as it is after so many \
                    steps (at eta = 1 the best mean minus its mean). Line: mean over seeds; band: lowest \
@@ -130,18 +128,16 @@ pub(super) fn regret(panels: &[Panel]) -> Option<(String, String)> {
     Some((svg, caption.to_owned()))
 }
 
-pub(super) fn budget(panels: &[Panel]) -> Option<(String, String)> {
+pub(super) fn budget(panels: &[Panel]) -> Option<(Picture, String)> {
+    let by_time = |values: &[f64]| (0..).map(f64::from).zip(values.iter().copied()).collect();
     let mut found = Vec::new();
     let mut exact = Vec::new();
     for panel in panels {
-        let exhibits =
-            || panel.archives.iter().filter_map(|(_, archive)| archive.exhibits.as_ref());
-        let mean = |of: fn(&crate::experiment::exhibits::BudgetByTime) -> &Vec<f64>| {
-            let seeds: Vec<Vec<(f64, f64)>> = exhibits()
-                .filter_map(|exhibits| exhibits.budget.as_ref())
-                .map(|budget| (0..).map(f64::from).zip(of(budget).iter().copied()).collect())
-                .collect();
-            over_seeds(&seeds)
+        let seeds: Vec<&FigureData> =
+            panel.seeds.iter().filter_map(|(_, records)| records.figure_data.as_ref()).collect();
+        let mean = |of: fn(&BudgetByTime) -> &Vec<f64>| {
+            let budgets = seeds.iter().filter_map(|data| data.budget.as_ref());
+            over_seeds(&budgets.map(|budget| by_time(of(budget))).collect::<Vec<_>>())
         };
         let (low, high) = (mean(|of| &of.low), mean(|of| &of.high));
         found.push(
@@ -149,14 +145,12 @@ pub(super) fn budget(panels: &[Panel]) -> Option<(String, String)> {
                 .map(|(band, (low, high))| Band { low: low.middle, high: high.middle, ..*band })
                 .collect(),
         );
-        let seeds: Vec<Vec<(f64, f64)>> = exhibits()
-            .filter_map(|exhibits| match &exhibits.world {
-                WorldExhibit::LavaGrid(grid) => Some(&grid.exact_budget),
-                WorldExhibit::LavaPoint(_) => None,
-            })
-            .map(|budget| (0..).map(f64::from).zip(budget.iter().copied()).collect())
-            .collect();
-        exact.push(over_seeds(&seeds).iter().map(|band| (band.x, band.middle)).collect());
+        let budgets = seeds.iter().filter_map(|data| match &data.world {
+            WorldData::Cells(cells) => Some(by_time(&cells.exact_budget)),
+            WorldData::Plane(_) => None,
+        });
+        let bands = over_seeds(&budgets.collect::<Vec<_>>());
+        exact.push(bands.iter().map(|band| (band.x, band.middle)).collect());
     }
     let svg = bands(panels, &found, ("time t (steps)", "log eta_t / log eta"), &exact)?;
     let mut caption = "Remaining budget of the episodes that still run at time t, greedy protagonist against \
@@ -169,34 +163,32 @@ pub(super) fn budget(panels: &[Panel]) -> Option<(String, String)> {
     Some((svg, caption))
 }
 
-/// Mean and CVaR of the policies that are optimal at budgets from 1 to the greatest.
-fn optima(config: &GridConfig, gamma: f64, greatest: f64, alpha: f64) -> Vec<(f64, f64)> {
-    let Ok(exact) = ExactGrid::new(config, gamma) else { return Vec::new() };
-    let budget = |step: u32| greatest.powf(f64::from(step) / f64::from(OPTIMA));
-    let point = |step| {
-        let law = exact.optimum(budget(step)).ok()?.evaluation.law;
-        Some((law.cvar(alpha), law.mean()))
-    };
-    (0..=OPTIMA).filter_map(point).filter(|(x, y)| drawable(*x) && drawable(*y)).collect()
+/// The budgets from 1 to the greatest at which optima are drawn.
+pub(super) fn frontier_budgets(greatest: f64) -> Vec<f64> {
+    (0..=OPTIMA).map(|step| greatest.powf(f64::from(step) / f64::from(OPTIMA))).collect()
 }
 
+/// `optima` are the laws of the policies that are optimal at [`frontier_budgets`], where the world has an
+/// exact yardstick.
 pub(super) fn frontier(
     panels: &[Panel],
-    grid: Option<(&GridConfig, f64)>,
-) -> Option<(String, String)> {
-    let levels: Vec<f64> =
+    optima: Option<&[ReturnLaw]>,
+    greatest: f64,
+) -> Option<(Picture, String)> {
+    let mut levels: Vec<f64> =
         panels.iter().map(|panel| panel.group.alpha()).filter(|a| *a < 1.0).collect();
-    let greatest = panels.iter().map(|panel| panel.group.eta).fold(1.0, f64::max);
-    let curves: Vec<Vec<(f64, f64)>> = (levels.iter())
-        .map(|&alpha| {
-            grid.map_or(Vec::new(), |(config, gamma)| optima(config, gamma, greatest, alpha))
-        })
-        .collect();
+    levels.sort_by(|a, b| b.total_cmp(a));
+    levels.dedup();
+    let curve = |&alpha: &f64| {
+        let points = optima.into_iter().flatten().map(|law| (law.cvar(alpha), law.mean()));
+        points.filter(|(x, y)| drawable(*x) && drawable(*y)).collect()
+    };
+    let curves: Vec<Vec<(f64, f64)>> = levels.iter().map(curve).collect();
     let dots: Vec<Vec<(usize, f64, f64)>> = (levels.iter())
         .map(|&alpha| {
             let of_panel = |(place, panel): (usize, &Panel)| {
                 let level = panel.group.level(alpha);
-                let point = |measures: &crate::report::group::Measures| {
+                let point = |measures: &Measures| {
                     let (x, y) = (measures.cvar[level]?, measures.mean?);
                     (drawable(x) && drawable(y)).then_some((place, x, y))
                 };
@@ -211,16 +203,18 @@ pub(super) fn frontier(
     };
     let (x, y) = (span(points().map(|(x, _)| x))?, span(points().map(|(_, y)| y))?);
     let width = 690 * levels.len().max(1) as u32;
-    let svg = figure((width, 720), |canvas| {
-        let (top, below) = canvas.split_vertically(46);
-        let named = |(place, panel): (usize, &Panel)| {
-            (format!("trained at eta = {}", panel.group.eta), colour(place))
-        };
-        let mut words: Vec<_> = panels.iter().enumerate().map(named).collect();
-        if grid.is_some() {
-            words.push(("exact optima".to_owned(), INK));
-        }
-        legend(&top, &words)?;
+    let named = |(place, panel): (usize, &Panel)| {
+        let method = panel.group.method.as_ref().map_or(String::new(), |of| format!("{of} "));
+        (format!("{method}trained at eta = {}", panel.group.eta), colour(place))
+    };
+    let mut words: Vec<_> = panels.iter().enumerate().map(named).collect();
+    if optima.is_some() {
+        words.push(("exact optima".to_owned(), INK));
+    }
+    let legend = Legend::new(words, width);
+    let svg = figure((width, legend.height + 674), |canvas| {
+        let (top, below) = canvas.split_vertically(legend.height);
+        legend.draw(&top)?;
         for ((area, &alpha), (dots, curve)) in
             below.split_evenly((1, levels.len())).iter().zip(&levels).zip(dots.iter().zip(&curves))
         {
@@ -238,18 +232,18 @@ pub(super) fn frontier(
         Ok(())
     })?;
     let mut caption = "A dot is the greedy protagonist of one seed under nominal chance: its mean return \
-                       against the mean of its worst alpha-share of returns. Up and right is better."
+                       against the mean of its worst alpha-share of returns. Up and to the right is better."
         .to_owned();
-    if grid.is_some() {
+    if optima.is_some() {
         caption += &format!(
             " Black: the policies that are exactly optimal at budgets from 1 to {greatest}, each at \
-             both coordinates; no policy lies right of the curve's right end."
+             both coordinates; no policy lies to the right of the curve's right end."
         );
     }
     Some((svg, caption))
 }
 
-pub(super) fn cross(panels: &[Panel]) -> Option<(String, String)> {
+pub(super) fn cross(panels: &[Panel]) -> Option<(Picture, String)> {
     let cell = |panel: &Panel, alpha| {
         let level = panel.group.level(alpha);
         panel.group.mean(|measures| measures.cvar[level]).map(|estimate| estimate.value)
@@ -262,7 +256,9 @@ pub(super) fn cross(panels: &[Panel]) -> Option<(String, String)> {
     if low > high {
         return None;
     }
-    let (left, width, height, top) = (190, 160, 92, 120);
+    let titles = panels.iter().filter(|panel| panel.group.method.is_some());
+    let widest = titles.map(|panel| words_width(&panel.group.title())).max().unwrap_or_default();
+    let (left, width, height, top) = (190.max(widest + 40), 160, 92, 120);
     let size = (left + width * ALPHAS.len() as i32 + 30, top + height * panels.len() as i32 + 90);
     let svg = figure((size.0 as u32, size.1 as u32), |canvas| {
         let centred = |colour| text(TEXT, colour, HPos::Center, VPos::Center);
@@ -278,7 +274,7 @@ pub(super) fn cross(panels: &[Panel]) -> Option<(String, String)> {
         for (row, (panel, values)) in panels.iter().zip(&values).enumerate() {
             let y = top + height * row as i32;
             canvas.draw(&Text::new(
-                format!("eta = {}", panel.group.eta),
+                panel.group.title(),
                 (left - 18, y + height / 2),
                 text(TEXT, INK, HPos::Right, VPos::Center),
             ))?;

@@ -1,13 +1,15 @@
-//! Maps of the two scenes, one panel for each eta.
+//! Maps of the scene, one panel for each row of the table: heat maps of worlds of cells, trajectories and
+//! shifted noise of worlds in the plane.
 
 use super::Panel;
 use super::canvas::{
-    Area, Drawn, FAINT, GOAL, INK, LAVA, TEXT, colour, figure, frame, heat, on, scale, short, text,
+    Area, Drawn, FAINT, GOAL, INK, LAVA, Picture, TEXT, colour, figure, frame, heat, on, scale,
+    short, text,
 };
-use crate::experiment::exhibits::{
-    BINS_PER_METRE, BUDGET_CLASSES, Deviations, GridExhibit, PointExhibit, ShiftMap, WorldExhibit,
+use crate::experiment::figure_data::{
+    BINS_PER_METRE, BUDGET_CLASSES, CellData, Deviations, PlaneData, ShiftMap, WorldData,
 };
-use lava_envs::{GridConfig, LavaGrid, PointConfig};
+use lava_envs::scene::{Area as Place, AreaKind, Scene};
 use plotters::prelude::*;
 use plotters::style::text_anchor::{HPos, VPos};
 
@@ -19,9 +21,11 @@ const MARGIN: (i32, i32) = (24, 60);
 const STRIP: i32 = 70;
 
 /// Larger maps are not drawn.
-const MOST_CELLS: usize = 10_000;
+const MOST_CELLS: f64 = 10_000.0;
+/// Nor are planes with a longer side.
+const LONGEST_SIDE: f64 = 1_000.0;
 
-/// Cells with fewer steps say nothing about a probability (the paper's threshold).
+/// With fewer steps in a cell, a probability is not shown (the paper's threshold).
 const LEAST_VISITS: f64 = 500.0;
 /// The same for a mean of noise: its standard error is then below 0.1.
 const LEAST_STEPS: u64 = 100;
@@ -33,6 +37,29 @@ struct Layout {
     extent: (f64, f64),
     /// Height of the strip below them.
     strip: i32,
+}
+
+/// The column and the row of each panel: those of one method are beside each other.
+fn places<'a>(panels: impl Iterator<Item = &'a Panel<'a>>) -> Vec<(usize, usize)> {
+    let mut places: Vec<(usize, usize)> = Vec::new();
+    let mut last: Option<&Panel> = None;
+    for panel in panels {
+        let (column, row) = places.last().copied().unwrap_or_default();
+        places.push(match last {
+            None => (0, 0),
+            Some(last) if last.group.method == panel.group.method => (column + 1, row),
+            Some(_) => (0, row + 1),
+        });
+        last = Some(panel);
+    }
+    places
+}
+
+/// A layout of panels in these places, each of `rows` maps one below the other, in a scene.
+fn layout(scene: &Scene, places: &[(usize, usize)], rows: usize) -> Layout {
+    let columns = places.iter().map(|(column, _)| column + 1).max().unwrap_or(1);
+    let blocks = places.iter().map(|(_, row)| row + 1).max().unwrap_or(1);
+    Layout { columns, rows: blocks * rows, extent: scene.size.into(), strip: STRIP }
 }
 
 impl Layout {
@@ -58,9 +85,43 @@ fn at(origin: (i32, i32), x: f64, y: f64) -> (i32, i32) {
     (origin.0 + units(x), origin.1 + units(y))
 }
 
-/// The world of a grid, if it is small enough for its cells to be seen.
-fn visible(config: &GridConfig) -> Option<LavaGrid> {
-    LavaGrid::new(config, 1).ok().filter(|grid| grid.cells() <= MOST_CELLS)
+/// A scene of cells.
+struct Grid {
+    width: usize,
+    height: usize,
+    /// What each cell is, row by row; `None` where nothing is.
+    kinds: Vec<Option<AreaKind>>,
+}
+
+impl Grid {
+    /// The cells of a scene, if they are few enough to be seen.
+    fn of(scene: &Scene) -> Option<Grid> {
+        let [width, height] = scene.size;
+        if !(width >= 1.0 && height >= 1.0 && width * height <= MOST_CELLS) {
+            return None;
+        }
+        let (width, height) = (width as usize, height as usize);
+        let mut kinds = vec![None; width * height];
+        for Place { kind, min, max } in &scene.areas {
+            let (rows, columns) =
+                (min[1] as usize..max[1] as usize, min[0] as usize..max[0] as usize);
+            for y in rows {
+                for x in columns.clone().filter(|x| *x < width && y < height) {
+                    kinds[y * width + x] = Some(*kind);
+                }
+            }
+        }
+        Some(Grid { width, height, kinds })
+    }
+
+    fn cells(&self) -> usize {
+        self.kinds.len()
+    }
+
+    /// The corner of a cell.
+    fn corner(&self, cell: usize) -> (f64, f64) {
+        ((cell % self.width) as f64, (cell / self.width) as f64)
+    }
 }
 
 fn title(canvas: &Area, origin: (i32, i32), words: &str, colour: RGBColor) -> Drawn {
@@ -69,41 +130,45 @@ fn title(canvas: &Area, origin: (i32, i32), words: &str, colour: RGBColor) -> Dr
 }
 
 /// Lava, goal, walls and the lines between cells, over whatever the cells show.
-fn cells(canvas: &Area, grid: &LavaGrid, origin: (i32, i32)) -> Drawn {
-    let (width, height) = (grid.width(), grid.height());
-    for cell in 0..grid.cells() {
-        let (x, y) = grid.coordinates(cell);
-        let corners = [at(origin, x as f64, y as f64), at(origin, x as f64 + 1.0, y as f64 + 1.0)];
-        let middle = at(origin, x as f64 + 0.5, y as f64 + 0.5);
-        let centred = |colour| text(TEXT, colour, HPos::Center, VPos::Center);
-        if grid.is_lava(cell) {
-            canvas.draw(&Rectangle::new(corners, LAVA.filled()))?;
-        } else if grid.is_wall(cell) {
-            canvas.draw(&Rectangle::new(corners, INK.filled()))?;
-        } else if grid.is_goal(cell) {
-            canvas.draw(&Rectangle::new(corners, GOAL.filled()))?;
-            canvas.draw(&Text::new("G", middle, centred(on(GOAL))))?;
+fn cells(canvas: &Area, grid: &Grid, origin: (i32, i32)) -> Drawn {
+    for (cell, kind) in grid.kinds.iter().enumerate() {
+        let (x, y) = grid.corner(cell);
+        let corners = [at(origin, x, y), at(origin, x + 1.0, y + 1.0)];
+        if let Some(kind) = kind {
+            canvas.draw(&Rectangle::new(corners, fill(*kind).filled()))?;
+        }
+        if *kind == Some(AreaKind::Goal) {
+            let style = text(TEXT, on(GOAL), HPos::Center, VPos::Center);
+            canvas.draw(&Text::new("G", at(origin, x + 0.5, y + 0.5), style))?;
         }
         canvas.draw(&frame(corners, FAINT.stroke_width(1)))?;
     }
-    let corners = [origin, at(origin, width as f64, height as f64)];
+    let corners = [origin, at(origin, grid.width as f64, grid.height as f64)];
     canvas.draw(&frame(corners, INK.stroke_width(3)))
+}
+
+fn fill(kind: AreaKind) -> RGBColor {
+    match kind {
+        AreaKind::Lava => LAVA,
+        AreaKind::Goal => GOAL,
+        AreaKind::Wall => INK,
+    }
 }
 
 /// Values of cells as colours with their numbers; `None` stays empty.
 fn heat_map(
     canvas: &Area,
-    grid: &LavaGrid,
+    grid: &Grid,
     origin: (i32, i32),
     values: &[Option<f64>],
     greatest: f64,
 ) -> Drawn {
     for (cell, value) in values.iter().enumerate() {
-        let Some(value) = value.filter(|_| !grid.is_lava(cell) && !grid.is_goal(cell)) else {
-            continue;
-        };
-        let (x, y) = grid.coordinates(cell);
-        let (x, y) = (x as f64, y as f64);
+        // Episodes end in lava and goal: nothing happens there.
+        let ends =
+            matches!(grid.kinds.get(cell), Some(Some(AreaKind::Lava | AreaKind::Goal)) | None);
+        let Some(value) = value.filter(|_| !ends) else { continue };
+        let (x, y) = grid.corner(cell);
         let shade = heat(value / greatest);
         let corners = [at(origin, x, y), at(origin, x + 1.0, y + 1.0)];
         canvas.draw(&Rectangle::new(corners, shade.filled()))?;
@@ -115,64 +180,64 @@ fn heat_map(
     cells(canvas, grid, origin)
 }
 
-fn whole(grid: &LavaGrid) -> (f64, f64) {
-    (grid.width() as f64, grid.height() as f64)
-}
-
-pub(super) fn grid(config: &GridConfig) -> Option<(String, String)> {
-    let grid = visible(config)?;
-    let layout = Layout { columns: 1, rows: 1, extent: whole(&grid), strip: 0 };
-    let svg = figure(layout.size(), |canvas| {
+pub(super) fn map(scene: &Scene) -> Option<(Picture, String)> {
+    let grid = Grid::of(scene)?;
+    let layout = Layout { columns: 1, rows: 1, extent: scene.size.into(), strip: 0 };
+    let picture = figure(layout.size(), |canvas| {
         let origin = layout.origin(0, 0);
         cells(canvas, &grid, origin)?;
-        let (x, y) = grid.coordinates(grid.start());
         let style = text(TEXT, INK, HPos::Center, VPos::Center);
-        canvas.draw(&Text::new("S", at(origin, x as f64 + 0.5, y as f64 + 0.5), style))?;
+        let [x, y] = scene.start;
+        canvas.draw(&Text::new("S", at(origin, x + 0.5, y + 0.5), style))?;
         title(canvas, origin, "S start, G goal, orange lava", INK)
     })?;
-    let GridConfig { slip, step_cost, goal_reward, lava_reward, horizon, .. } = config;
-    let caption = format!(
-        "The paper's Figure 2. A step costs {step_cost}, lava pays {lava_reward} and the goal {goal_reward}, \
-         both of which end the episode; so does step {horizon}. With probability {slip} another than the \
-         chosen move is executed."
-    );
-    Some((svg, caption))
+    Some((picture, scene.rules.clone()))
 }
 
-/// The exhibits of a panel's seeds that are of the grid.
-fn of_grid<'a>(panel: &'a Panel) -> impl Iterator<Item = &'a GridExhibit> {
-    panel.archives.iter().filter_map(|(_, archive)| match &archive.exhibits.as_ref()?.world {
-        WorldExhibit::LavaGrid(grid) => Some(grid),
-        WorldExhibit::LavaPoint(_) => None,
+/// The data of a panel's seeds that are of cells.
+fn of_cells<'a>(panel: &'a Panel) -> impl Iterator<Item = &'a CellData> {
+    panel.seeds.iter().filter_map(|(_, records)| match &records.figure_data.as_ref()?.world {
+        WorldData::Cells(cells) => Some(cells),
+        WorldData::Plane(_) => None,
     })
 }
 
-pub(super) fn occupancy(config: &GridConfig, panels: &[Panel]) -> Option<(String, String)> {
-    let grid = visible(config)?;
+/// The data of a panel's seeds that are of the plane.
+fn of_plane<'a>(panel: &'a Panel) -> impl Iterator<Item = &'a PlaneData> {
+    panel.seeds.iter().filter_map(|(_, records)| match &records.figure_data.as_ref()?.world {
+        WorldData::Plane(plane) => Some(plane),
+        WorldData::Cells(_) => None,
+    })
+}
+
+pub(super) fn occupancy(scene: &Scene, panels: &[(usize, &Panel)]) -> Option<(Picture, String)> {
+    let grid = Grid::of(scene)?;
     let mean = |panel: &Panel| -> Option<Vec<Option<f64>>> {
-        let count = of_grid(panel).count() as f64;
-        let sum = |cell: usize| of_grid(panel).filter_map(|of| of.occupancy.get(cell)).sum::<f64>();
+        let count = of_cells(panel).count() as f64;
+        let sum =
+            |cell: usize| of_cells(panel).filter_map(|of| of.occupancy.get(cell)).sum::<f64>();
         let seen = |cell| Some(sum(cell) / count).filter(|visits| *visits >= 0.005);
         (count > 0.0).then(|| (0..grid.cells()).map(seen).collect())
     };
     let maps: Vec<(&Panel, Vec<Option<f64>>)> =
-        panels.iter().filter_map(|panel| Some((panel, mean(panel)?))).collect();
+        panels.iter().filter_map(|(_, panel)| Some((*panel, mean(panel)?))).collect();
     if maps.is_empty() {
         return None;
     }
     let greatest = 1.0;
-    let layout = Layout { columns: maps.len(), rows: 1, extent: whole(&grid), strip: STRIP };
-    let svg = figure(layout.size(), |canvas| {
-        for (column, (panel, values)) in maps.iter().enumerate() {
-            let origin = layout.origin(column, 0);
-            title(canvas, origin, &format!("eta = {}", panel.group.eta), INK)?;
+    let places = places(maps.iter().map(|(panel, _)| *panel));
+    let layout = layout(scene, &places, 1);
+    let picture = figure(layout.size(), |canvas| {
+        for ((column, row), (panel, values)) in places.iter().zip(&maps) {
+            let origin = layout.origin(*column, *row);
+            title(canvas, origin, &panel.group.title(), INK)?;
             heat_map(canvas, &grid, origin, values, greatest)?;
         }
         strip(canvas, &layout, "visits per episode", ["0".to_owned(), "1 and more".to_owned()])
     })?;
-    let caption = "The paper's Figure 3: expected visits of the greedy protagonist in an episode without slips \
-                   (p = 0), averaged over seeds; exact. Empty cells: below 0.005.";
-    Some((svg, caption.to_owned()))
+    let caption = "As in the paper's Figure 3: expected visits of the greedy protagonist in an episode in which \
+                   every chosen move is executed, averaged over seeds; exact. Empty cells: below 0.005.";
+    Some((picture, caption.to_owned()))
 }
 
 fn strip(canvas: &Area, layout: &Layout, title: &str, ends: [String; 2]) -> Drawn {
@@ -180,10 +245,10 @@ fn strip(canvas: &Area, layout: &Layout, title: &str, ends: [String; 2]) -> Draw
     scale(&canvas.margin(top, 0, 0, 0), title, ends)
 }
 
-pub(super) fn deviations(config: &GridConfig, panels: &[Panel]) -> Option<(String, String)> {
-    let grid = visible(config)?;
-    let pooled = |panel: &Panel, of: fn(&GridExhibit) -> Option<&Deviations>| {
-        let seeds: Vec<&Deviations> = of_grid(panel).filter_map(of).collect();
+pub(super) fn deviations(scene: &Scene, panels: &[(usize, &Panel)]) -> Option<(Picture, String)> {
+    let grid = Grid::of(scene)?;
+    let pooled = |panel: &Panel, of: fn(&CellData) -> Option<&Deviations>| {
+        let seeds: Vec<&Deviations> = of_cells(panel).filter_map(of).collect();
         let sum = |cell: usize, of: fn(&Deviations) -> &Vec<f64>| {
             seeds.iter().filter_map(|seed| of(seed).get(cell)).sum::<f64>()
         };
@@ -195,75 +260,75 @@ pub(super) fn deviations(config: &GridConfig, panels: &[Panel]) -> Option<(Strin
     };
     type Maps = Vec<Option<f64>>;
     let maps: Vec<(&Panel, [Maps; 2])> = (panels.iter())
-        .filter_map(|panel| {
+        .filter_map(|(_, panel)| {
             let learned = pooled(panel, |of| of.learned.as_ref())?;
-            Some((panel, [learned, pooled(panel, |of| of.exact.as_ref())?]))
+            Some((*panel, [learned, pooled(panel, |of| of.exact.as_ref())?]))
         })
         .collect();
     let all = || maps.iter().flat_map(|(_, maps)| maps.iter().flatten().flatten());
-    let greatest = all().copied().fold(config.slip, f64::max);
+    let greatest = all().copied().fold(0.0, f64::max);
     if maps.is_empty() {
         return None;
     }
-    let layout = Layout { columns: maps.len(), rows: 2, extent: whole(&grid), strip: STRIP };
-    let svg = figure(layout.size(), |canvas| {
-        for (column, (panel, maps)) in maps.iter().enumerate() {
+    let places = places(maps.iter().map(|(panel, _)| *panel));
+    let layout = layout(scene, &places, 2);
+    let picture = figure(layout.size(), |canvas| {
+        for ((column, block), (panel, maps)) in places.iter().zip(&maps) {
             for (row, (name, values)) in
                 ["learned", "exact worst case"].iter().zip(maps).enumerate()
             {
-                let origin = layout.origin(column, row);
-                title(canvas, origin, &format!("eta = {}, {name}", panel.group.eta), INK)?;
+                let origin = layout.origin(*column, 2 * block + row);
+                title(canvas, origin, &format!("{}, {name}", panel.group.title()), INK)?;
                 heat_map(canvas, &grid, origin, values, greatest)?;
             }
         }
         strip(canvas, &layout, "P(deviation)", ["0".to_owned(), format!("{greatest:.2}")])
     })?;
-    let episodes = (maps.iter())
-        .find_map(|(panel, _)| panel.archives.iter().find_map(|(_, of)| of.exhibits.as_ref()))
-        .map_or(0, |exhibits| exhibits.episodes);
+    let data = |(panel, _): &(&Panel, _)| {
+        panel.seeds.iter().find_map(|(_, records)| Some(records.figure_data.as_ref()?.episodes))
+    };
+    let episodes = maps.iter().find_map(data).unwrap_or_default();
     let caption = format!(
-        "The paper's Figure 4: probability that the executed move is not the chosen one ({} without an \
-         antagonist), greedy protagonist. Above against its learned antagonist, counted over {episodes} \
-         trajectories per seed; below against the exact worst case, computed for the same policies. Seeds \
-         pooled; cells with at least {LEAST_VISITS} visits.",
-        config.slip
+        "As in the paper's Figure 4: probability that the executed move is not the chosen one, greedy \
+         protagonist. Above against its learned antagonist, counted over {episodes} trajectories per seed; \
+         below against the exact worst case, computed for the same policies. Seeds pooled; cells with at \
+         least {LEAST_VISITS} visits. Without an antagonist: {}",
+        scene.rules
     );
-    Some((svg, caption))
+    Some((picture, caption))
 }
 
-/// Lava, goal, start and border of the point mass's arena.
-fn arena(canvas: &Area, config: &PointConfig, origin: (i32, i32)) -> Drawn {
-    for (area, colour) in [(config.lava, LAVA), (config.goal, GOAL)] {
-        let corners = [at(origin, area.min[0], area.min[1]), at(origin, area.max[0], area.max[1])];
-        canvas.draw(&Rectangle::new(corners, colour.filled()))?;
+/// Lava, goal, walls, start and border of a place in the plane.
+fn arena(canvas: &Area, scene: &Scene, origin: (i32, i32)) -> Drawn {
+    for Place { kind, min, max } in &scene.areas {
+        let corners = [at(origin, min[0], min[1]), at(origin, max[0], max[1])];
+        canvas.draw(&Rectangle::new(corners, fill(*kind).filled()))?;
     }
-    let start = at(origin, config.start[0], config.start[1]);
+    let start = at(origin, scene.start[0], scene.start[1]);
     canvas.draw(&Circle::new(start, 7, INK.stroke_width(3)))?;
-    let corners = [origin, at(origin, config.arena[0], config.arena[1])];
+    let corners = [origin, at(origin, scene.size[0], scene.size[1])];
     canvas.draw(&frame(corners, INK.stroke_width(3)))
 }
 
-fn of_point<'a>(panel: &'a Panel) -> impl Iterator<Item = &'a PointExhibit> {
-    panel.archives.iter().filter_map(|(_, archive)| match &archive.exhibits.as_ref()?.world {
-        WorldExhibit::LavaPoint(point) => Some(point),
-        WorldExhibit::LavaGrid(_) => None,
-    })
+/// Whether a place in the plane is of a size that can be drawn.
+fn is_drawable(scene: &Scene) -> bool {
+    scene.size.iter().all(|side| *side > 0.0 && *side <= LONGEST_SIDE)
 }
 
-pub(super) fn trajectories(config: &PointConfig, panels: &[Panel]) -> Option<(String, String)> {
+pub(super) fn trajectories(scene: &Scene, panels: &[(usize, &Panel)]) -> Option<(Picture, String)> {
     let shown: Vec<(usize, &Panel)> =
-        panels.iter().enumerate().filter(|(_, panel)| of_point(panel).count() > 0).collect();
-    if shown.is_empty() {
+        panels.iter().copied().filter(|(_, panel)| of_plane(panel).count() > 0).collect();
+    if shown.is_empty() || !is_drawable(scene) {
         return None;
     }
-    let layout =
-        Layout { columns: shown.len(), rows: 1, extent: config.arena.into(), strip: STRIP };
-    let svg = figure(layout.size(), |canvas| {
-        for (column, (place, panel)) in shown.iter().enumerate() {
-            let origin = layout.origin(column, 0);
-            title(canvas, origin, &format!("eta = {}", panel.group.eta), INK)?;
-            arena(canvas, config, origin)?;
-            for path in of_point(panel).flat_map(|of| &of.trajectories) {
+    let places = places(shown.iter().map(|(_, panel)| *panel));
+    let layout = layout(scene, &places, 1);
+    let picture = figure(layout.size(), |canvas| {
+        for ((column, row), (place, panel)) in places.iter().zip(&shown) {
+            let origin = layout.origin(*column, *row);
+            title(canvas, origin, &panel.group.title(), INK)?;
+            arena(canvas, scene, origin)?;
+            for path in of_plane(panel).flat_map(|of| &of.trajectories) {
                 let line: Vec<(i32, i32)> = path.iter().map(|[x, y]| at(origin, *x, *y)).collect();
                 canvas.draw(&PathElement::new(line, colour(*place).mix(0.5).stroke_width(2)))?;
             }
@@ -273,18 +338,19 @@ pub(super) fn trajectories(config: &PointConfig, panels: &[Panel]) -> Option<(St
         let y = layout.size().1 as i32 - STRIP / 2;
         canvas.draw(&Text::new(note, (MARGIN.0, y), style))
     })?;
-    let each = shown.iter().flat_map(|(_, panel)| of_point(panel)).map(|of| of.trajectories.len());
+    let each = shown.iter().flat_map(|(_, panel)| of_plane(panel)).map(|of| of.trajectories.len());
     let caption = format!(
         "Greedy protagonists of all seeds under nominal chance, the first {} episodes of each; all meet the \
-         same noise.",
-        each.max().unwrap_or_default()
+         same noise. {}",
+        each.max().unwrap_or_default(),
+        scene.rules
     );
-    Some((svg, caption))
+    Some((picture, caption))
 }
 
 /// The seeds' maps of one class as one, weighted by their steps.
 fn pooled(panel: &Panel, class: usize) -> Option<ShiftMap> {
-    let seeds: Vec<&ShiftMap> = of_point(panel).filter_map(|of| of.shifts.get(class)).collect();
+    let seeds: Vec<&ShiftMap> = of_plane(panel).filter_map(|of| of.shifts.get(class)).collect();
     let bins = seeds.first()?.visits.len();
     let mut map = ShiftMap {
         visits: vec![0; bins],
@@ -305,16 +371,19 @@ fn pooled(panel: &Panel, class: usize) -> Option<ShiftMap> {
     Some(map)
 }
 
-pub(super) fn shifts(config: &PointConfig, panels: &[Panel]) -> Option<(String, String)> {
+pub(super) fn shifts(scene: &Scene, panels: &[(usize, &Panel)]) -> Option<(Picture, String)> {
+    if !is_drawable(scene) {
+        return None;
+    }
     let maps: Vec<(&Panel, Vec<ShiftMap>)> = (panels.iter())
-        .filter_map(|panel| {
+        .filter_map(|(_, panel)| {
             let classes: Option<Vec<ShiftMap>> =
                 (0..BUDGET_CLASSES).map(|class| pooled(panel, class)).collect();
-            Some((panel, classes?))
+            Some((*panel, classes?))
         })
         .collect();
-    let bins = of_point(maps.first()?.0).next()?.bins;
-    // What nearly all bins stay below; a few rare ones would take all the colours.
+    let bins = of_plane(maps.first()?.0).next()?.bins;
+    // 98 % of the bins stay below it; a few rare ones would take all the colours.
     let mut divergences: Vec<f64> = (maps.iter().flat_map(|(_, maps)| maps))
         .flat_map(|map| map.divergence.iter().zip(&map.visits))
         .filter(|(_, visits)| **visits >= LEAST_STEPS)
@@ -322,41 +391,37 @@ pub(super) fn shifts(config: &PointConfig, panels: &[Panel]) -> Option<(String, 
         .collect();
     divergences.sort_by(f64::total_cmp);
     let greatest = *divergences.get(divergences.len().saturating_sub(1) * 98 / 100)?;
-    let layout = Layout {
-        columns: maps.len(),
-        rows: BUDGET_CLASSES,
-        extent: config.arena.into(),
-        strip: STRIP,
-    };
-    let svg = figure(layout.size(), |canvas| {
-        for (column, (panel, classes)) in maps.iter().enumerate() {
+    let places = places(maps.iter().map(|(panel, _)| *panel));
+    let layout = layout(scene, &places, BUDGET_CLASSES);
+    let picture = figure(layout.size(), |canvas| {
+        for ((column, block), (panel, classes)) in places.iter().zip(&maps) {
             for (class, map) in classes.iter().enumerate() {
-                // The fullest purse on top: there an episode begins.
+                // The largest remaining budget on top: an episode begins with it.
                 let row = BUDGET_CLASSES - 1 - class;
-                let origin = layout.origin(column, row);
+                let origin = layout.origin(*column, block * BUDGET_CLASSES + row);
                 let share = |class: usize| short(class as f64 / BUDGET_CLASSES as f64);
                 let range = if row == 0 {
                     format!("budget left: {} and more", share(class))
                 } else {
                     format!("budget left: {} to {}", share(class), share(class + 1))
                 };
-                title(canvas, origin, &format!("eta = {}, {range}", panel.group.eta), INK)?;
+                title(canvas, origin, &format!("{}, {range}", panel.group.title()), INK)?;
                 shift_map(canvas, origin, bins, map, greatest)?;
-                arena(canvas, config, origin)?;
+                arena(canvas, scene, origin)?;
             }
         }
         let ends = ["0".to_owned(), format!("{greatest:.2} nats")];
         strip(canvas, &layout, "KL to nominal", ends)
     })?;
     let caption = format!(
-        "How the learned antagonist bends the noise against the greedy protagonist, averaged over the steps \
+        "How the learned antagonist shifts the noise against the greedy protagonist, averaged over the steps \
          that began in a square of {} m (at least {LEAST_STEPS}), seeds pooled, by remaining budget log \
          eta_t / log eta. Arrow: mean of the noise xi, nominally 0; an arrow as long as a square is 1 \
-         standard deviation. Colour: divergence of the bent law from the nominal one, the mean of log \
+         standard deviation. Colour: divergence of the shifted law from the nominal one, the mean of log \
          delta_t(o_t).",
         1.0 / BINS_PER_METRE
     );
-    Some((svg, caption))
+    Some((picture, caption))
 }
 
 fn shift_map(

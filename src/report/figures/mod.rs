@@ -3,23 +3,24 @@
 //! | figure | module |
 //! |---|---|
 //! | learning curves, frontier, cross matrix, regret, budget over time | `curves` |
-//! | the grid, where the protagonist goes, where its antagonists make moves slip | `maps` |
-//! | trajectories of the point mass, how its antagonist shifts the noise | `maps` |
+//! | worlds of cells: the map, where the protagonist goes, where its antagonists change its moves | `maps` |
+//! | worlds in the plane: trajectories, how the antagonist shifts the noise | `maps` |
 //! | panels, colours, axes, PNG | `canvas` |
 //!
-//! Every eta has one colour (Okabe & Ito's, told apart by the colour-blind), and panels of one figure
-//! have one pair of axes.
+//! Every row of the table has one colour (Okabe & Ito's, which the colour-blind can tell apart), and
+//! panels of one figure have one pair of axes.
 
 mod canvas;
 mod curves;
 mod maps;
 
-pub use canvas::png;
+pub use canvas::{Picture, png};
 
-use super::ReportError;
-use super::archive::Archive;
+use super::Worlds;
 use super::group::Group;
+use super::records::{Constants, Records};
 use super::runs::Run;
+use super::table::Results;
 
 /// A finished figure.
 #[derive(Debug, Clone, PartialEq)]
@@ -28,16 +29,39 @@ pub struct Figure {
     pub name: String,
     /// Headline.
     pub title: String,
-    /// What is to be seen, and how it was made.
+    /// What it shows, and how it was made.
     pub caption: String,
     /// The picture.
-    pub svg: String,
+    pub picture: Picture,
 }
 
-/// The runs of one world and eta, with all that lies in their folders.
-struct Panel<'a> {
-    group: &'a Group<'a>,
-    archives: Vec<(&'a Run, Archive)>,
+/// The runs of one world, method and eta, with their records.
+pub struct Panel<'a> {
+    /// The runs, measured.
+    pub group: &'a Group<'a>,
+    /// By seed.
+    pub seeds: Vec<(&'a Run, Records)>,
+}
+
+impl Panel<'_> {
+    /// The constants of the first seed that has any; all seeds share them.
+    pub fn constants(&self) -> Option<&Constants> {
+        self.seeds.iter().find_map(|(_, records)| records.constants.as_ref())
+    }
+}
+
+/// Reads the records of all runs, by world, then by method and eta, and notes about files that cannot
+/// be read.
+pub fn panels<'a>(results: &'a [Results<'a>]) -> (Vec<Panel<'a>>, Vec<String>) {
+    let mut groups: Vec<&Group> = results.iter().flat_map(|results| &results.groups).collect();
+    // Stable: within a world the methods keep their order.
+    groups.sort_by_key(|group| group.env);
+    let mut notes = Vec::new();
+    let panels = groups.into_iter().map(|group| {
+        let seeds = group.runs.iter().map(|run| (run, Records::read(run, &mut notes))).collect();
+        Panel { group, seeds }
+    });
+    (panels.collect(), notes)
 }
 
 /// What could be drawn, and what could not and why.
@@ -47,68 +71,68 @@ pub struct Figures {
     pub drawn: Vec<Figure>,
     /// Figures left out.
     pub missing: Vec<String>,
+    /// Files that could not be read, and are missing in the figures.
+    pub notes: Vec<String>,
 }
 
-/// Draws all figures that the artefacts allow.
-///
-/// # Errors
-/// If a file of a run is there and cannot be read.
-pub fn draw(groups: &[Group]) -> Result<Figures, ReportError> {
-    let mut figures = Figures::default();
-    for groups in groups.chunk_by(|a, b| a.env == b.env) {
-        let panels: Vec<Panel> = groups
-            .iter()
-            .map(|group| {
-                let archives = (group.runs.iter())
-                    .map(|run| Ok((run, Archive::read(run)?)))
-                    .collect::<Result<_, ReportError>>()?;
-                Ok(Panel { group, archives })
-            })
-            .collect::<Result<_, ReportError>>()?;
-        figures.add_world(groups[0].env, &panels);
+/// Draws all figures that the records allow.
+pub fn draw(panels: &[Panel], notes: Vec<String>, worlds: &dyn Worlds) -> Figures {
+    let mut figures = Figures { notes, ..Figures::default() };
+    for panels in panels.chunk_by(|a, b| a.group.env == b.group.env) {
+        figures.add_world(panels, worlds);
     }
-    Ok(figures)
+    figures
 }
 
 impl Figures {
-    fn add_world(&mut self, env: &str, panels: &[Panel]) {
-        let world = panels.iter().flat_map(|panel| &panel.archives);
-        let constants = world.clone().find_map(|(_, archive)| archive.world.as_ref());
-        let mut add = |name: &str, title: &str, figure: Option<(String, String)>| match figure {
-            Some((svg, caption)) => self.drawn.push(Figure {
+    fn add_world(&mut self, panels: &[Panel], worlds: &dyn Worlds) {
+        let env = panels[0].group.env;
+        let constants = panels.iter().find_map(Panel::constants);
+        let scene = constants.and_then(|of| worlds.scene(env, &of.world));
+        let mut add = |name: &str, title: &str, figure: Option<(Picture, String)>| match figure {
+            Some((picture, caption)) => self.drawn.push(Figure {
                 name: format!("{env}-{name}"),
                 title: format!("{env}: {title}"),
                 caption,
-                svg,
+                picture,
             }),
             None => self.missing.push(format!("{env}: {title}")),
         };
-        use crate::experiment::config::WorldConfig::{LavaGrid, LavaPoint};
-        match constants {
-            Some((LavaGrid(config), gamma)) => {
-                add("map", "the map", maps::grid(config));
-                add("occupancy", "where the protagonist goes", maps::occupancy(config, panels));
-                add("deviations", "where chance is bent", maps::deviations(config, panels));
+        // Maps show the panels of one and the same world.
+        let (here, elsewhere): (Vec<_>, Vec<_>) = (panels.iter().enumerate())
+            .partition(|(_, panel)| panel.constants().is_none_or(|own| Some(own) == constants));
+        match &scene {
+            Some(scene) if scene.cells => {
+                add("map", "the map", maps::map(scene));
+                add("occupancy", "where the protagonist goes", maps::occupancy(scene, &here));
                 add(
-                    "frontier",
-                    "mean against CVaR",
-                    curves::frontier(panels, Some((config, *gamma))),
+                    "deviations",
+                    "where the antagonist changes moves",
+                    maps::deviations(scene, &here),
                 );
-                add("regret", "regret in training", curves::regret(panels));
             }
-            Some((LavaPoint(config), _)) => {
-                add(
-                    "trajectories",
-                    "where the protagonist goes",
-                    maps::trajectories(config, panels),
-                );
-                add("shifts", "how chance is bent", maps::shifts(config, panels));
-                add("frontier", "mean against CVaR", curves::frontier(panels, None));
+            Some(scene) => {
+                add("trajectories", "where the protagonist goes", maps::trajectories(scene, &here));
+                add("shifts", "how the antagonist shifts the noise", maps::shifts(scene, &here));
             }
-            None => add("frontier", "mean against CVaR", curves::frontier(panels, None)),
+            None => {}
+        }
+        let greatest = panels.iter().map(|panel| panel.group.eta).fold(1.0, f64::max);
+        let optima = constants.filter(|_| here.len() == panels.len()).and_then(|of| {
+            worlds.frontier(env, &of.world, of.gamma, &curves::frontier_budgets(greatest))
+        });
+        add("frontier", "mean against CVaR", curves::frontier(panels, optima.as_deref(), greatest));
+        let regret = curves::regret(panels);
+        // Without an exact yardstick there is no regret in training.
+        if optima.is_some() || regret.is_some() {
+            add("regret", "regret in training", regret);
         }
         add("cross", "every policy at every level", curves::cross(panels));
         add("learning", "learning curves", curves::learning(panels));
         add("budget", "the budget over time", curves::budget(panels));
+        self.missing.extend(elsewhere.iter().map(|(_, panel)| {
+            let title = panel.group.title();
+            format!("{env}: maps of {title}, whose constants are not those of the others")
+        }));
     }
 }

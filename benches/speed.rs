@@ -1,0 +1,216 @@
+//! Environment steps per second of the parts of training, and of training itself, with the default
+//! options, one thread and eta = 25.
+//!
+//! The benchmarks of the worlds are in `envs/benches/stepping.rs`. `cargo xtask speed` runs both and makes a table.
+//! Every benchmark's throughput is in environment steps, so that the times of the parts add up:
+//!
+//! | benchmark | what one environment step is |
+//! |---|---|
+//! | `perturbation/FAMILY/make` | one perturbation from its parameters |
+//! | `perturbation/FAMILY/learn` | likelihood ratio, score and entropy as well |
+//! | `rollout/WORLD` | one step of one of 250 episodes, recorded for both players |
+//! | `update/WORLD/PLAYER` | one sample of the rollout: critic, advantages, all epochs |
+//! | `train/WORLD` | all of it: Algorithm 1 with the antagonist active from the start |
+
+use criterion::{BatchSize, BenchmarkId, Criterion, Throughput, criterion_group, criterion_main};
+use cvar_game::experiment::config::{Config, Source};
+use cvar_game::experiment::registry::standard;
+use cvar_game::game::budget::{Budget, Eta};
+use cvar_game::game::finite::FiniteFamily;
+use cvar_game::game::gaussian::GaussianFamily;
+use cvar_game::game::perturbation::{Family, Perturbation};
+use cvar_game::learn::device::Device;
+use cvar_game::learn::family::Named;
+use cvar_game::learn::method::{Arena, Setting, Training};
+use cvar_game::learn::methods::game::GameTraining;
+use cvar_game::learn::options::TrainOptions;
+use cvar_game::learn::pair::Pair;
+use cvar_game::learn::policy::Mode;
+use cvar_game::learn::ppo::Rates;
+use cvar_game::learn::rollout::{Collector, Terms};
+use lava_envs::random::{ChaCha8Rng, Purpose, stream};
+use lava_envs::{GaussianLaw, LavaGrid, LavaPoint, Law, Move, World};
+use rand::RngExt;
+use rand_distr::StandardNormal;
+use std::hint::black_box;
+use std::sync::LazyLock;
+use std::time::Duration;
+
+const SEED: u64 = 1;
+const ETA: f64 = 25.0;
+/// Perturbations made in a row: as many as a rollout has slots.
+const PERTURBATIONS: usize = 250;
+/// Updates of one short training: two rounds of K = 2 and 1.
+const UPDATES: u64 = 6;
+
+fn eta() -> Eta {
+    Eta::new(ETA).expect("a budget")
+}
+
+/// The default training options of a world, played at the full budget from the start.
+fn options<W: World>() -> TrainOptions {
+    let config = Config::resolve(standard().catalogue(), Source::Default, &[])
+        .expect("the embedded default configuration");
+    TrainOptions { budget_wait: 0.0, budget_rise: 0.0, ..config.world(W::NAME).train.clone() }
+}
+
+/// A world with its default constants and as many slots as the options say.
+fn world<W: World>(options: &TrainOptions) -> W {
+    W::new(&W::defaults(), options.parallel_episodes).expect("the default constants")
+}
+
+fn setting(options: &TrainOptions) -> Setting<'_> {
+    static NO_OPTIONS: LazyLock<toml::Table> = LazyLock::new(toml::Table::new);
+    let (eta, device) = (eta(), Device::Cpu);
+    Setting { eta, gamma: 1.0, seed: SEED, device, options, own: &NO_OPTIONS }
+}
+
+fn perturbations(criterion: &mut Criterion) {
+    let grid: LavaGrid = world(&options::<LavaGrid>());
+    let law = grid.law(0, Move::ALL[0]);
+    let family = FiniteFamily::<4>::with(&options::<LavaGrid>().family);
+    perturbations_of(criterion, "finite", &family, law);
+    let family = GaussianFamily::with(&options::<LavaPoint>().family);
+    perturbations_of(criterion, "gaussian", &family, GaussianLaw);
+}
+
+fn perturbations_of<F: Family>(criterion: &mut Criterion, name: &str, family: &F, law: F::Law) {
+    let mut group = criterion.benchmark_group("perturbation");
+    group.throughput(Throughput::Elements(PERTURBATIONS as u64));
+    let random = &mut stream(SEED, Purpose::Outcomes, 0);
+    let budget = Budget::start(eta());
+    let cases: Vec<_> = (0..PERTURBATIONS)
+        .map(|_| {
+            let parameters: Vec<f64> =
+                (0..family.parameters()).map(|_| random.sample(StandardNormal)).collect();
+            (parameters, law.sample(random))
+        })
+        .collect();
+    group.bench_function(BenchmarkId::new(name, "make"), |bencher| {
+        bencher.iter(|| {
+            for (parameters, _) in &cases {
+                black_box(family.perturbation(black_box(parameters), &law, budget));
+            }
+        });
+    });
+    group.bench_function(BenchmarkId::new(name, "learn"), |bencher| {
+        let mut score = vec![0.0; family.parameters()];
+        let mut entropy_gradient = vec![0.0; family.parameters()];
+        bencher.iter(|| {
+            for (parameters, outcome) in &cases {
+                let perturbation = family.perturbation(black_box(parameters), &law, budget);
+                black_box(perturbation.likelihood_ratio(*outcome));
+                perturbation.score(*outcome, &mut score);
+                black_box(perturbation.entropy(&mut entropy_gradient));
+                black_box((&score, &entropy_gradient));
+            }
+        });
+    });
+    group.finish();
+}
+
+fn rollouts(criterion: &mut Criterion) {
+    rollout::<LavaGrid>(criterion);
+    rollout::<LavaPoint>(criterion);
+}
+
+/// How the rollouts are played.
+fn terms() -> Terms {
+    Terms { eta: eta(), mode: Mode::Sampled }
+}
+
+fn rollout<W: Arena>(criterion: &mut Criterion) {
+    let options = options::<W>();
+    let mut group = criterion.benchmark_group("rollout");
+    group.throughput(Throughput::Elements(options.rollout()));
+    let (pair, mut collector) = opening::<W>(&options);
+    group.bench_function(W::NAME, |bencher| {
+        bencher.iter(|| collector.collect(&pair, terms(), &options));
+    });
+    group.finish();
+}
+
+fn updates(criterion: &mut Criterion) {
+    update::<LavaGrid>(criterion);
+    update::<LavaPoint>(criterion);
+}
+
+/// The learning rate is 0: every update costs the same, and the players stay as they are.
+fn update<W: Arena>(criterion: &mut Criterion) {
+    let options = options::<W>();
+    let mut group = criterion.benchmark_group("update");
+    group.throughput(Throughput::Elements(options.rollout()));
+    let (mut pair, mut collector) = opening::<W>(&options);
+    collector.collect(&pair, terms(), &options);
+    let rates = |entropy: f64| Rates { learning_rate: 0.0, entropy };
+    let random: &mut ChaCha8Rng = &mut stream(SEED, Purpose::Minibatches, 0);
+
+    let player = &mut pair.protagonist;
+    let its = &options.protagonist;
+    group.bench_function(BenchmarkId::new(W::NAME, "protagonist"), |bencher| {
+        bencher.iter(|| {
+            player.update(&collector.protagonist, None, 1.0, its, rates(its.entropy), random)
+        });
+    });
+    let player = pair.antagonist.as_mut().expect("eta is above 1");
+    let its = &options.antagonist;
+    let observation = pair.observation;
+    let more = |inputs: &mut [f32], by: f64| observation.with_more_budget::<W>(inputs, by);
+    group.bench_function(BenchmarkId::new(W::NAME, "antagonist"), |bencher| {
+        bencher.iter(|| {
+            let played = &collector.antagonist;
+            let sensitivity =
+                options.budget_sensitivity.then(|| player.budget_sensitivity(played, &more));
+            player.update(played, sensitivity.as_ref(), 1.0, its, rates(its.entropy), random)
+        });
+    });
+    group.finish();
+}
+
+fn trainings(criterion: &mut Criterion) {
+    training::<LavaGrid>(criterion);
+    training::<LavaPoint>(criterion);
+}
+
+fn training<W: Arena>(criterion: &mut Criterion) {
+    let mut options = options::<W>();
+    options.steps = UPDATES * options.rollout();
+    let mut group = criterion.benchmark_group("train");
+    group.sample_size(10);
+    group.throughput(Throughput::Elements(options.steps));
+    let setting = setting(&options);
+    group.bench_function(W::NAME, |bencher| {
+        bencher.iter_batched(
+            || world::<W>(&options),
+            |world| {
+                let mut training = GameTraining::new(world, &setting);
+                while let Ok(Some(progress)) = training.update() {
+                    black_box(progress);
+                }
+            },
+            BatchSize::PerIteration,
+        );
+    });
+    group.finish();
+}
+
+/// A fresh pair and its games.
+fn opening<W: Arena>(options: &TrainOptions) -> (Pair<W>, Collector<W>) {
+    let setting = setting(options);
+    (Pair::new(&setting), Collector::new(world(options), &setting))
+}
+
+/// Short measurements: the whole file in a minute.
+fn configured() -> Criterion {
+    Criterion::default()
+        .sample_size(20)
+        .warm_up_time(Duration::from_secs(1))
+        .measurement_time(Duration::from_secs(3))
+}
+
+criterion_group! {
+    name = benches;
+    config = configured();
+    targets = perturbations, rollouts, updates, trainings
+}
+criterion_main!(benches);

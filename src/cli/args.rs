@@ -1,0 +1,379 @@
+//! The arguments of the command line.
+
+use crate::experiment::artefacts::Chance;
+use crate::experiment::config::{Catalogue, Config, ConfigError, Setting, Source};
+use crate::experiment::names::{MethodName, RunId, WorldName};
+use crate::experiment::steps::Format;
+use crate::learn::device::Device;
+use crate::learn::policy::Mode;
+use clap::{Args, Parser, Subcommand};
+use std::num::NonZeroUsize;
+use std::path::PathBuf;
+
+/// A benchmark for risk-sensitive reinforcement learning by games, with exact yardsticks.
+#[derive(Debug, Parser)]
+#[command(
+    version,
+    after_help = "\
+Examples:
+  cvar-game bench
+      train and evaluate both worlds at eta 1, 25 and 100, and print the table
+  cvar-game train --env lava-grid --eta 25 --seed 1 --steps 1000000
+      one run
+  cvar-game exact --env lava-grid --eta 25
+      the best CVaR_0.04 there is on the grid
+  cvar-game config --set env.slip=0.1
+      the resolved configuration; `cvar-game config --default` explains all options
+
+Exit codes:
+  0 done, 1 a run failed, 2 bad input or usage;
+  75 stopped by SIGTERM, 130 by Ctrl-C: the same command continues where it was"
+)]
+pub struct Cli {
+    #[command(subcommand)]
+    /// What to do.
+    pub verb: Verb,
+}
+
+/// A verb.
+#[expect(missing_docs, reason = "the text of a verb is on its arguments")]
+#[derive(Debug, Subcommand)]
+pub enum Verb {
+    Bench(BenchArgs),
+    Train(TrainArgs),
+    Evaluate(EvaluateArgs),
+    Rollout(RolloutArgs),
+    Exact(ExactArgs),
+    Table(TableArgs),
+    Figures(FiguresArgs),
+    Report(ReportArgs),
+    Pack(PackArgs),
+    Slurm(SlurmArgs),
+    Envs(EnvsArgs),
+    Config(PrintArgs),
+    /// Carry out the run of a folder, for `bench`.
+    #[command(hide = true)]
+    Worker {
+        /// Folder of the run.
+        #[arg(long)]
+        folder: PathBuf,
+    },
+}
+
+/// Which configuration.
+#[derive(Debug, Args)]
+pub struct Overrides {
+    /// Sets one option over file and default; the value is TOML. `env.KEY` means that key in every
+    /// selected world that has it. May be repeated; a later one wins.
+    #[arg(long = "set", value_name = "KEY=VALUE")]
+    pub settings: Vec<String>,
+}
+
+impl Overrides {
+    /// The configuration of these overrides, with `options` of the command line over them.
+    ///
+    /// # Errors
+    /// If a setting is not one, or a key or value is refused.
+    pub fn resolve(
+        &self,
+        catalogue: &Catalogue,
+        file: Source<'_>,
+        options: Vec<Setting>,
+    ) -> Result<Config, ConfigError> {
+        let settings: Result<Vec<Setting>, _> =
+            self.settings.iter().map(|text| Setting::parse(text)).collect();
+        let mut settings = settings?;
+        settings.extend(options);
+        Config::resolve(catalogue, file, &settings)
+    }
+}
+
+/// Train and evaluate every run of a configuration, then print the table of results.
+///
+/// Finished runs are kept and unfinished ones continue from their last checkpoint: the same command
+/// continues where it was stopped, with the same results. Several may work on one folder at once, on one
+/// machine or many: no run is done twice.
+#[derive(Debug, Args)]
+#[command(after_help = "\
+Examples:
+  cvar-game bench --config configs/quick.toml
+  cvar-game bench --config configs/paper.toml --out results/slippery --set env.slip=0.1
+  cvar-game bench --config configs/quick.toml --jobs 1 --set 'experiment.seeds=[1]' --out /tmp/try
+  cvar-game bench --config configs/paper.toml --only lava-grid/game/eta-25/seed-3")]
+pub struct BenchArgs {
+    /// Configuration file [default: configs/quick.toml, which is embedded in the program].
+    #[arg(long, value_name = "FILE")]
+    pub config: Option<PathBuf>,
+    /// Output folder [default: results/ and the name of the configuration file].
+    #[arg(long, value_name = "DIR")]
+    pub out: Option<PathBuf>,
+    /// Runs at the same time, one thread each [default: the processor's cores].
+    #[arg(long, value_name = "N", value_parser = at_least_one)]
+    pub jobs: Option<NonZeroUsize>,
+    /// Carry out only this run of the configuration and write no table: for schedulers, one task per run.
+    #[arg(long, value_name = "RUN_ID")]
+    pub only: Option<RunId>,
+    /// Device of the networks: cpu, cuda or cuda:N.
+    #[arg(long)]
+    pub device: Option<Device>,
+    /// Options set on the command line.
+    #[command(flatten)]
+    pub overrides: Overrides,
+}
+
+/// Train and evaluate one run.
+#[derive(Debug, Args)]
+#[command(after_help = "\
+Examples:
+  cvar-game train --env lava-grid --eta 25 --seed 1 --steps 1000000
+  cvar-game train --env lava-point --eta 1 --seed 7 --set train.protagonist.minibatch=500 --json")]
+pub struct TrainArgs {
+    /// World, such as lava-grid or lava-point.
+    #[arg(long)]
+    pub env: WorldName,
+    /// Method of training [default: game, the paper's Algorithm 1].
+    #[arg(long)]
+    pub method: Option<MethodName>,
+    /// Budget, at least 1; the risk level is alpha = 1/eta.
+    #[arg(long, allow_negative_numbers = true)]
+    pub eta: f64,
+    /// Seed of all that is random, a whole number from 0.
+    #[arg(long, allow_negative_numbers = true, value_parser = clap::value_parser!(i64).range(0..))]
+    pub seed: i64,
+    /// Environment steps.
+    #[arg(long, allow_negative_numbers = true)]
+    pub steps: Option<i64>,
+    /// Configuration file.
+    #[arg(long, value_name = "FILE")]
+    pub config: Option<PathBuf>,
+    /// Output folder; the run gets its own folder in it.
+    #[arg(long, value_name = "DIR", default_value = "results/train")]
+    pub out: PathBuf,
+    /// Device of the networks: cpu, cuda or cuda:N.
+    #[arg(long)]
+    pub device: Option<Device>,
+    /// End with one JSON object on standard output.
+    #[arg(long)]
+    pub json: bool,
+    /// Options set on the command line.
+    #[command(flatten)]
+    pub overrides: Overrides,
+}
+
+/// Play episodes with the players of a finished run.
+#[derive(Debug, Args)]
+#[command(after_help = "\
+Examples:
+  cvar-game evaluate results/quick/lava-grid/game/eta-25/seed-1
+  cvar-game evaluate results/quick/lava-point/game/eta-25/seed-1 --antagonist learned --episodes 1000000")]
+pub struct EvaluateArgs {
+    /// Folder of the run.
+    #[arg(value_name = "RUN_DIR")]
+    pub folder: PathBuf,
+    /// Who decides the law of chance.
+    #[arg(long, value_enum, default_value_t = Chance::Nominal)]
+    pub antagonist: Chance,
+    /// Episodes of each play [default: as the run was evaluated].
+    #[arg(long, value_parser = clap::value_parser!(u64).range(1..))]
+    pub episodes: Option<u64>,
+    /// Seed of the episodes [default: as the run was evaluated].
+    #[arg(long)]
+    pub seed: Option<u64>,
+    /// Answer as JSON.
+    #[arg(long)]
+    pub json: bool,
+}
+
+/// Play episodes with the players of a finished run and write every step of them.
+///
+/// A row per step, to standard output. CSV: `episode`, `t`, what the world's state is before the step
+/// (grid: `x`, `y`, in cells; point: `x`, `y` in m, `vx`, `vy` in m/s), the chosen `action` (point:
+/// `action_x`, `action_y`, before it is scaled onto the unit disc), what chance decided (grid:
+/// `executed`, the move; point: `xi_x`, `xi_y`, the noise), its likelihood ratio `delta`, the remaining
+/// `budget` before the step, `reward`, `clearance` to lava after the step, and how the episode `end`ed
+/// with it (`goal`, `lava`, `timeout`, or empty). JSON: an object per step and line, with these names.
+#[derive(Debug, Args)]
+#[command(after_help = "\
+Examples:
+  cvar-game rollout --run results/quick/lava-grid/game/eta-25/seed-1 --episodes 1000 > episodes.csv
+  cvar-game rollout --run results/quick/lava-point/game/eta-25/seed-1 --antagonist learned --format json")]
+pub struct RolloutArgs {
+    /// Folder of the run.
+    #[arg(long, value_name = "DIR")]
+    pub run: PathBuf,
+    /// Number of episodes.
+    #[arg(long, default_value_t = 100, value_parser = clap::value_parser!(u64).range(1..))]
+    pub episodes: u64,
+    /// Format of the rows.
+    #[arg(long, value_enum, default_value_t = Format::Csv)]
+    pub format: Format,
+    /// How the protagonist picks its actions.
+    #[arg(long, value_enum, default_value_t = Mode::Greedy)]
+    pub protagonist: Mode,
+    /// Who decides the law of chance.
+    #[arg(long, value_enum, default_value_t = Chance::Nominal)]
+    pub antagonist: Chance,
+    /// Seed of the episodes [default: as the run was evaluated].
+    #[arg(long)]
+    pub seed: Option<u64>,
+}
+
+/// Solve a world: the best CVaR there is, and how to reach it.
+///
+/// lava-grid is solved exactly. On lava-point a near-optimal controller is computed on a lattice and
+/// played in the physical world, which takes minutes; what it attains there is a lower bound on the
+/// best CVaR. The certificates of the default world at eta 1, 2, 5, 10, 25, 50 and 100 come with the
+/// program; others are kept in $XDG_CACHE_HOME/cvar-game/oracle, by default under ~/.cache.
+#[derive(Debug, Args)]
+#[command(after_help = "\
+Examples:
+  cvar-game exact --env lava-grid --eta 25
+  cvar-game exact --env lava-grid --eta 100 --set env.slip=0.1 --json
+  cvar-game exact --env lava-point --eta 25
+  cvar-game exact --env lava-point --eta 25 --cell 0.2 --velocity 0.75")]
+pub struct ExactArgs {
+    /// World, such as lava-grid or lava-point.
+    #[arg(long)]
+    pub env: WorldName,
+    /// Budget, at least 1; the risk level is alpha = 1/eta.
+    #[arg(long, allow_negative_numbers = true)]
+    pub eta: f64,
+    /// Configuration file.
+    #[arg(long, value_name = "FILE")]
+    pub config: Option<PathBuf>,
+    /// lava-point: distance of the lattice's positions, in m [default: 0.1].
+    #[arg(long, value_name = "M")]
+    pub cell: Option<f64>,
+    /// lava-point: distance of the lattice's velocities, in m/s [default: 0.5].
+    #[arg(long, value_name = "M/S")]
+    pub velocity: Option<f64>,
+    /// lava-point: compute even if there is a certificate.
+    #[arg(long)]
+    pub anew: bool,
+    /// Answer as JSON.
+    #[arg(long)]
+    pub json: bool,
+    /// Options set on the command line.
+    #[command(flatten)]
+    pub overrides: Overrides,
+}
+
+/// Write the table of results of a folder again and print it.
+#[derive(Debug, Args)]
+#[command(after_help = "\
+Examples:
+  cvar-game table results/quick
+  cvar-game table results/paper --compare results/ablations --compare my-method")]
+pub struct TableArgs {
+    /// Output folder of `bench` or `train`.
+    #[arg(value_name = "DIR")]
+    pub folder: PathBuf,
+    /// Another such folder, to be compared with DIR in comparison.md, .csv and .tex. May be repeated.
+    #[arg(long, value_name = "DIR")]
+    pub compare: Vec<PathBuf>,
+    /// Print the table as JSON and write nothing.
+    #[arg(long)]
+    pub json: bool,
+}
+
+/// Draw the figures of a results folder into its subfolder `figures`, as SVG and PNG.
+#[derive(Debug, Args)]
+pub struct FiguresArgs {
+    /// Output folder of `bench` or `train`.
+    #[arg(value_name = "DIR")]
+    pub folder: PathBuf,
+}
+
+/// Write everything about a results folder again: tables, figures and report.html.
+///
+/// The page needs no network and no other file.
+#[derive(Debug, Args)]
+pub struct ReportArgs {
+    /// Output folder of `bench` or `train`.
+    #[arg(value_name = "DIR")]
+    pub folder: PathBuf,
+}
+
+/// Pack the records of a results folder into one archive, DIR/runs.zip.
+///
+/// The archive holds what `table`, `figures`, `report` and `bench` read of finished runs, and they read it
+/// as if the folders of the runs were there. It is checked before the folders are removed.
+#[derive(Debug, Args)]
+pub struct PackArgs {
+    /// Output folder of `bench` or `train`.
+    #[arg(value_name = "DIR")]
+    pub folder: PathBuf,
+    /// Pack the weights of the players as well.
+    #[arg(long)]
+    pub weights: bool,
+}
+
+/// Hand a sweep to Slurm: a job array with one task per run, then a job that writes the table.
+///
+/// Writes the scripts to DIR/slurm. A task that reaches its time limit writes a checkpoint and is put
+/// into the queue again; finished runs are not submitted.
+#[derive(Debug, Args)]
+#[command(after_help = "\
+Examples:
+  cvar-game slurm --config configs/paper.toml --out /scratch/me/paper --time 2:00:00 --submit
+  cvar-game slurm --config configs/paper.toml --out sweep --array-limit 50 --extra=--mem=2G
+      then check sweep/slurm and run sweep/slurm/submit.sh")]
+pub struct SlurmArgs {
+    /// Configuration file.
+    #[arg(long, value_name = "FILE")]
+    pub config: PathBuf,
+    /// Output folder, on a file system that all nodes share and that has locks.
+    #[arg(long, value_name = "DIR")]
+    pub out: PathBuf,
+    /// Time limit of a task, as sbatch takes it [default: the partition's].
+    #[arg(long)]
+    pub time: Option<String>,
+    /// Partition [default: the cluster's].
+    #[arg(long)]
+    pub partition: Option<String>,
+    /// Most tasks at a time [default: as many as the cluster gives].
+    #[arg(long, value_name = "N", value_parser = at_least_one)]
+    pub array_limit: Option<NonZeroUsize>,
+    /// Another option of sbatch, such as --extra=--mem=2G. May be repeated.
+    #[arg(long, value_name = "OPTION", allow_hyphen_values = true)]
+    pub extra: Vec<String>,
+    /// Submit the jobs as well.
+    #[arg(long)]
+    pub submit: bool,
+    /// Options set on the command line.
+    #[command(flatten)]
+    pub overrides: Overrides,
+}
+
+/// List the worlds with their constants.
+#[derive(Debug, Args)]
+pub struct EnvsArgs {
+    /// Answer as JSON.
+    #[arg(long)]
+    pub json: bool,
+}
+
+/// Print the resolved configuration as TOML.
+#[derive(Debug, Args)]
+#[command(after_help = "\
+Examples:
+  cvar-game config --config configs/quick.toml
+  cvar-game config --env lava-point --set env.noise=2 > windy.toml")]
+pub struct PrintArgs {
+    /// Configuration file.
+    #[arg(long, value_name = "FILE")]
+    pub config: Option<PathBuf>,
+    /// Only this world.
+    #[arg(long)]
+    pub env: Option<WorldName>,
+    /// Print the annotated default instead: every option with its text, default and range.
+    #[arg(long, conflicts_with_all = ["config", "env", "settings"])]
+    pub default: bool,
+    /// Options set on the command line.
+    #[command(flatten)]
+    pub overrides: Overrides,
+}
+
+fn at_least_one(text: &str) -> Result<NonZeroUsize, String> {
+    text.parse().map_err(|_| "use a whole number of at least 1".to_owned())
+}

@@ -1,0 +1,352 @@
+//! The verbs of the command line.
+
+use super::answer::{give, print, print_json};
+use super::args::{
+    BenchArgs, Cli, EnvsArgs, EvaluateArgs, ExactArgs, FiguresArgs, PackArgs, PrintArgs,
+    RolloutArgs, SlurmArgs, TableArgs, TrainArgs, Verb,
+};
+use super::progress::Progress;
+use super::summary;
+use crate::exact::yardstick;
+use crate::experiment::archive;
+use crate::experiment::config::catalogue::annotated_constants;
+use crate::experiment::config::{Config, RunConfig, Setting, Source};
+use crate::experiment::failure::RunError;
+use crate::experiment::names::{MethodName, RunId, WorldName};
+use crate::experiment::plan;
+use crate::experiment::registry::{Registry, Request};
+use crate::experiment::runner::{
+    self, Failure, InProcess, Launcher, Outcome, Prepared, Report, Workers,
+};
+use crate::experiment::slurm::{self, SlurmOptions};
+use crate::experiment::stop::{self, Stop};
+use crate::game::budget::Eta;
+use crate::learn::device::Device;
+use crate::report;
+use anyhow::{Context, Result, bail};
+use std::collections::BTreeMap;
+use std::io::{self, BufWriter};
+use std::num::NonZeroUsize;
+use std::path::Path;
+use std::process::{Command, ExitCode};
+
+/// Exit code of a program whose runs have failed.
+const FAILED: u8 = 1;
+
+/// Carries out what the command line asks for.
+///
+/// # Errors
+/// On bad input, before anything is overwritten.
+pub fn run(registry: &Registry, cli: Cli) -> Result<ExitCode> {
+    match cli.verb {
+        Verb::Bench(args) => bench(registry, &args),
+        Verb::Train(args) => train(registry, &args),
+        Verb::Evaluate(args) => evaluate(registry, &args),
+        Verb::Rollout(args) => rollout(registry, &args),
+        Verb::Exact(args) => exact(registry, &args),
+        Verb::Table(args) => table(&args),
+        Verb::Figures(args) => figures(registry, &args),
+        Verb::Report(args) => report(registry, &args.folder),
+        Verb::Pack(args) => pack(&args),
+        Verb::Slurm(args) => slurm(registry, &args),
+        Verb::Envs(args) => envs(registry, &args),
+        Verb::Config(args) => config(registry, &args),
+        Verb::Worker { folder } => {
+            let (catalogue, carry_out) = (registry.catalogue(), carry_out(registry));
+            Ok(ExitCode::from(runner::work(catalogue, &folder, &carry_out)))
+        }
+    }
+}
+
+fn bench(registry: &Registry, args: &BenchArgs) -> Result<ExitCode> {
+    let options = args.device.map(device).into_iter().collect();
+    let source = args.config.as_deref().map_or(Source::Quick, Source::File);
+    let config = args.overrides.resolve(registry.catalogue(), source, options)?;
+    let out = match (&args.out, &args.config) {
+        (Some(out), _) => out.clone(),
+        (None, None) => Path::new("results").join("quick"),
+        (None, Some(file)) => {
+            Path::new("results").join(file.file_stem().context("--config names no file")?)
+        }
+    };
+    let mut runs = plan::runs(&config);
+    if let Some(only) = &args.only {
+        if !runs.contains(only) {
+            bail!("--only {only}: the configuration has no such run; its first one is {}", runs[0]);
+        }
+        runs = vec![only.clone()];
+    }
+    let prepared = prepare(registry, &config, &runs, &out)?;
+    let jobs = match args.jobs {
+        Some(jobs) => jobs,
+        None => std::thread::available_parallelism().unwrap_or(NonZeroUsize::MIN),
+    };
+    let stop = Stop::on_signals().context("cannot listen to signals")?;
+    let outcome = sweep(&prepared, jobs, &Workers::of_this_program()?, &stop);
+    let any_finished = outcome.finished + prepared.finished.len() > 0;
+    let code = report_end(&outcome);
+    if outcome.stopped.is_none() && args.only.is_none() && any_finished {
+        let written = report::write_all(&out, registry)?;
+        print(&written.table)?;
+        eprintln!("written to {}", out.display());
+    }
+    Ok(code)
+}
+
+fn train(registry: &Registry, args: &TrainArgs) -> Result<ExitCode> {
+    let mut options = vec![
+        select(&args.env),
+        budget(args.eta)?,
+        Setting::option("--seed", "experiment.seeds", vec![args.seed]),
+    ];
+    options.extend(args.steps.map(|steps| Setting::option("--steps", "train.steps", steps)));
+    options.extend(args.device.map(device));
+    options.extend(args.method.as_ref().map(method));
+    let source = Source::of(args.config.as_deref());
+    let config = args.overrides.resolve(registry.catalogue(), source, options)?;
+    let ids = plan::runs(&config);
+    let [id] = &ids[..] else {
+        bail!("the configuration has {} variants or methods; use `bench --only RUN_ID`", ids.len());
+    };
+    let prepared = prepare(registry, &config, &ids, &args.out)?;
+    let outcome = if prepared.todo.is_empty() {
+        eprintln!("{id} has finished before; remove its folder to run it again");
+        Outcome::default()
+    } else {
+        let stop = Stop::on_signals().context("cannot listen to signals")?;
+        let carry_out = carry_out(registry);
+        sweep(&prepared, NonZeroUsize::MIN, &InProcess(&carry_out), &stop)
+    };
+    let folder = id.folder(&args.out);
+    let code = report_end(&outcome);
+    match runner::read_evaluation(&folder)? {
+        Some(evaluation) if code == ExitCode::SUCCESS => {
+            let summary = summary::Summary::new(&evaluation, &folder);
+            give(&summary, args.json)
+        }
+        _ => Ok(code),
+    }
+}
+
+/// Checks everything that can be checked before the first run starts.
+fn prepare<'a>(
+    registry: &'a Registry,
+    config: &Config,
+    runs: &[RunId],
+    out: &Path,
+) -> Result<Prepared<'a>> {
+    let prepared = runner::prepare(registry.catalogue(), config, runs, out)?;
+    for run in &prepared.todo {
+        run.device.require()?;
+    }
+    Ok(prepared)
+}
+
+/// Carries out the runs with progress on standard error.
+fn sweep(prepared: &Prepared, jobs: NonZeroUsize, launcher: &dyn Launcher, stop: &Stop) -> Outcome {
+    let mut progress = Progress::new(prepared.todo.len(), prepared.finished.len());
+    let outcome = runner::sweep(prepared, jobs, launcher, stop, &mut |event| progress.event(event));
+    progress.finish();
+    outcome
+}
+
+/// Reports why runs did not finish; the exit code.
+fn report_end(outcome: &Outcome) -> ExitCode {
+    for (run, reason) in &outcome.failed {
+        eprintln!("error: {run} failed: {reason}");
+    }
+    if let Some(signal) = outcome.stopped {
+        eprintln!("stopped; finished runs are kept, and the same command continues with the rest");
+        return ExitCode::from(stop::exit_code(signal));
+    }
+    if outcome.failed.is_empty() { ExitCode::SUCCESS } else { ExitCode::from(FAILED) }
+}
+
+fn device(device: Device) -> Setting {
+    Setting::option("--device", "device", device.to_string())
+}
+
+fn method(method: &MethodName) -> Setting {
+    Setting::option("--method", "experiment.methods", vec![method.as_str()])
+}
+
+fn evaluate(registry: &Registry, args: &EvaluateArgs) -> Result<ExitCode> {
+    let request = Request { chance: args.antagonist, episodes: args.episodes, seed: args.seed };
+    let run = read_run(registry, &args.folder)?;
+    let plays = registry.world(&run.env)?.evaluate(&run, &args.folder, &request)?;
+    give(&summary::Plays::new(&run.id(), &plays, &run.evaluation.alphas), args.json)
+}
+
+fn rollout(registry: &Registry, args: &RolloutArgs) -> Result<ExitCode> {
+    let run = read_run(registry, &args.run)?;
+    let (chance, episodes) = (args.antagonist, Some(args.episodes));
+    let request = Request { chance, episodes, seed: args.seed };
+    let rows = (args.protagonist, args.format);
+    let output = &mut BufWriter::new(io::stdout().lock());
+    match registry.world(&run.env)?.rollout(&run, &args.run, &request, rows, output) {
+        // A reader that stops reading (`| head`) is not an error.
+        Err(RunError::Output(error)) if error.kind() == io::ErrorKind::BrokenPipe => {}
+        result => result?,
+    }
+    Ok(ExitCode::SUCCESS)
+}
+
+/// Carries out runs for the runner, which wants a failure in words.
+fn carry_out(
+    registry: &Registry,
+) -> impl Fn(&RunConfig, &Path, &Stop, &mut dyn FnMut(Report)) -> Result<(), Failure> + Sync + '_ {
+    |run, folder, stop, report| {
+        let world = registry.world(&run.env);
+        let result = world.and_then(|world| world.execute(run, folder, stop, report));
+        result.map_err(|error| match error {
+            RunError::Unfinished => Failure::Unfinished,
+            error => Failure::Failed(error.to_string()),
+        })
+    }
+}
+
+/// The configuration of a finished run whose players can be used here.
+fn read_run(registry: &Registry, folder: &Path) -> Result<RunConfig> {
+    let path = folder.join("config.toml");
+    if !path.exists() {
+        bail!(
+            "{} holds no run; give the folder of one, such as \
+             results/quick/lava-grid/game/eta-25/seed-1",
+            folder.display()
+        );
+    }
+    let run = RunConfig::load(&path, registry.catalogue())?;
+    if runner::read_evaluation(folder)?.is_none() {
+        bail!(
+            "the run in {} has not finished; continue it with the `bench` or `train` that began it",
+            folder.display()
+        );
+    }
+    run.device.require()?;
+    Ok(run)
+}
+
+/// The option `--env`.
+fn select(world: &WorldName) -> Setting {
+    Setting::option("--env", "experiment.envs", vec![world.as_str()])
+}
+
+/// The option `--eta`.
+///
+/// # Errors
+/// If it is no budget.
+fn budget(eta: f64) -> Result<Setting> {
+    let eta = Eta::new(eta).context("--eta")?;
+    Ok(Setting::option("--eta", "experiment.etas", vec![eta.get()]))
+}
+
+fn exact(registry: &Registry, args: &ExactArgs) -> Result<ExitCode> {
+    let options = vec![select(&args.env), budget(args.eta)?];
+    let source = Source::of(args.config.as_deref());
+    let config = args.overrides.resolve(registry.catalogue(), source, options)?;
+    let (gamma, eta) = (config.base.gamma, config.experiment.etas[0].get());
+    let options = yardstick::Options {
+        source: if args.anew { yardstick::Source::Anew } else { yardstick::Source::Computed },
+        cell: args.cell,
+        velocity: args.velocity,
+    };
+    let constants = &config.world(&args.env).constants;
+    let found = registry.world(constants)?.solve(constants, gamma, eta, &options)?;
+    print(&if args.json { found.json() } else { found.to_string() })
+}
+
+fn table(args: &TableArgs) -> Result<ExitCode> {
+    if args.json {
+        return print_json(&report::table_json(&args.folder, &args.compare)?);
+    }
+    print(&if args.compare.is_empty() {
+        report::write(&args.folder)?
+    } else {
+        report::write_comparison(&args.folder, &args.compare)?
+    })
+}
+
+fn figures(registry: &Registry, args: &FiguresArgs) -> Result<ExitCode> {
+    let figures = report::write_figures(&args.folder, registry)?;
+    report_missing(&figures);
+    print(&format!(
+        "{} figures written to {}",
+        figures.drawn.len(),
+        args.folder.join("figures").display()
+    ))
+}
+
+fn report(registry: &Registry, folder: &Path) -> Result<ExitCode> {
+    let written = report::write_all(folder, registry)?;
+    report_missing(&written.figures);
+    print(&folder.join("report.html").display().to_string())
+}
+
+/// Says which figures the artefacts did not allow.
+fn report_missing(figures: &report::figures::Figures) {
+    if !figures.missing.is_empty() {
+        eprintln!(
+            "left out, because the runs have no data for them: {}",
+            figures.missing.join("; ")
+        );
+    }
+    for note in &figures.notes {
+        eprintln!("missing in the figures: {note}");
+    }
+}
+
+fn slurm(registry: &Registry, args: &SlurmArgs) -> Result<ExitCode> {
+    let catalogue = registry.catalogue();
+    let config = args.overrides.resolve(catalogue, Source::File(&args.config), Vec::new())?;
+    let prepared = runner::prepare(catalogue, &config, &plan::runs(&config), &args.out)?;
+    if prepared.todo.is_empty() {
+        return print("all runs are finished; `cvar-game table` makes their table");
+    }
+    let runs: Vec<RunId> = prepared.todo.iter().map(RunConfig::id).collect();
+    let options = SlurmOptions {
+        time: args.time.clone(),
+        partition: args.partition.clone(),
+        array_limit: args.array_limit,
+        extra: args.extra.clone(),
+    };
+    let program =
+        std::env::current_exe().context("the system does not tell this program's path")?;
+    let submit = slurm::write(&config, &runs, &args.out, &program, &options)
+        .with_context(|| format!("cannot write to {}", args.out.display()))?;
+    if !args.submit {
+        let (count, submit) = (runs.len(), submit.display());
+        return print(&format!("{count} runs to do; submit them with: sh '{submit}'"));
+    }
+    let status = Command::new("sh").arg(&submit).status().context("cannot start sh")?;
+    if !status.success() {
+        bail!("sbatch refused the sweep; its scripts are in {}", args.out.join("slurm").display());
+    }
+    Ok(ExitCode::SUCCESS)
+}
+
+fn envs(registry: &Registry, args: &EnvsArgs) -> Result<ExitCode> {
+    let catalogue = registry.catalogue();
+    if !args.json {
+        let texts: Vec<String> = catalogue.worlds.iter().map(annotated_constants).collect();
+        return print(&texts.join("\n"));
+    }
+    let config = Config::resolve(catalogue, Source::Default, &[])?;
+    let constants: BTreeMap<_, _> =
+        config.base.worlds.values().map(|of| (&of.constants.world, &of.constants.table)).collect();
+    print_json(&constants)
+}
+
+fn config(registry: &Registry, args: &PrintArgs) -> Result<ExitCode> {
+    let catalogue = registry.catalogue();
+    if args.default {
+        return print(catalogue.annotated_default());
+    }
+    let options = args.env.iter().map(select).collect();
+    let source = Source::of(args.config.as_deref());
+    print(&args.overrides.resolve(catalogue, source, options)?.to_toml())
+}
+
+fn pack(args: &PackArgs) -> Result<ExitCode> {
+    let packed = archive::pack(&args.folder, args.weights)?;
+    print(&packed.to_string())
+}

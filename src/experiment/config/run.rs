@@ -1,0 +1,194 @@
+//! The configuration of one run, and its `config.toml`.
+
+use super::constants::WorldConstants;
+use super::keys::{self, dotted_leaves};
+use super::layers;
+use super::{
+    Catalogue, CheckpointOptions, ConfigError, EvaluationOptions, conflicts, printed, renamed,
+    rules, typed,
+};
+use crate::experiment::artefacts::SCHEMA;
+use crate::experiment::names::{MethodName, RunId, VariantName};
+use crate::game::budget::Eta;
+use crate::learn::device::Device;
+use crate::learn::method;
+use crate::learn::options::TrainOptions;
+use serde::{Deserialize, Serialize};
+use std::collections::BTreeMap;
+use std::path::Path;
+use toml::{Table, Value};
+
+/// The resolved configuration of one run.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct RunConfig {
+    /// Method of training; former versions had one method and did not write it.
+    #[serde(default = "MethodName::game")]
+    pub method: MethodName,
+    /// Variant of the experiment, if it has variants. Its options are in this configuration.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub variant: Option<VariantName>,
+    /// Budget eta.
+    pub eta: Eta,
+    /// Seed of all random streams of training.
+    pub seed: u64,
+    /// Discount factor gamma of the return.
+    pub gamma: f64,
+    /// Device of the networks.
+    pub device: Device,
+    /// The world.
+    pub env: WorldConstants,
+    /// Training options.
+    pub train: TrainOptions,
+    /// The method's own options.
+    #[serde(default, skip_serializing_if = "Table::is_empty")]
+    pub options: Table,
+    /// When the unfinished run is saved.
+    pub checkpoint: CheckpointOptions,
+    /// Evaluation protocol.
+    pub evaluation: EvaluationOptions,
+}
+
+impl RunConfig {
+    /// The run's name.
+    pub fn id(&self) -> RunId {
+        RunId {
+            world: self.env.world.clone(),
+            method: self.method.clone(),
+            variant: self.variant.clone(),
+            eta: self.eta,
+            seed: self.seed,
+        }
+    }
+
+    /// What determines the training of the run, except its world and method.
+    pub fn setting(&self) -> method::Setting<'_> {
+        method::Setting {
+            eta: self.eta,
+            gamma: self.gamma,
+            seed: self.seed,
+            device: self.device,
+            options: &self.train,
+            own: &self.options,
+        }
+    }
+
+    /// The text of the run's `config.toml`.
+    pub fn to_toml(&self) -> String {
+        #[derive(Serialize)]
+        struct File<'a> {
+            schema: u32,
+            #[serde(flatten)]
+            run: &'a RunConfig,
+        }
+        let file = File { schema: SCHEMA, run: self };
+        format!("# The resolved configuration of the run {}.\n{}", self.id(), printed(&file))
+    }
+
+    /// Reads a run's `config.toml`, of this version or a former one, with the same checks as any
+    /// configuration.
+    ///
+    /// # Errors
+    /// If the file cannot be read, is of another schema version or is not such a configuration.
+    pub fn load(path: &Path, catalogue: &Catalogue) -> Result<RunConfig, ConfigError> {
+        let (origin, table) = layers::read(path)?;
+        Self::checked(path, &origin, table, catalogue)
+    }
+
+    /// The same for a text, which is that of `path`.
+    ///
+    /// # Errors
+    /// As [`RunConfig::load`].
+    pub fn parse(path: &Path, text: &str, catalogue: &Catalogue) -> Result<RunConfig, ConfigError> {
+        let origin = path.display().to_string();
+        let table = layers::table(&origin, text)?;
+        Self::checked(path, &origin, table, catalogue)
+    }
+
+    fn checked(
+        path: &Path,
+        origin: &str,
+        mut table: Table,
+        catalogue: &Catalogue,
+    ) -> Result<RunConfig, ConfigError> {
+        match table.remove("schema") {
+            Some(Value::Integer(version)) if version == i64::from(SCHEMA) => {}
+            other => {
+                let found = other.map_or("none".to_owned(), |version| version.to_string());
+                return Err(ConfigError::Schema { path: path.to_owned(), found });
+            }
+        }
+        renamed::update(&mut table);
+        for (key, value) in keys::leaves(&table) {
+            check_range(catalogue, &key, &value, origin)?;
+        }
+        let mut run: RunConfig = typed(origin, table)?;
+        run.env = run.env.checked(catalogue)?;
+        run.options = options(catalogue, &run, origin)?;
+        let world = catalogue.world(&run.env.world)?;
+        let method = (&run.method, &run.options);
+        conflicts::check(catalogue, world, method, &run.train, world.name)?;
+        Ok(run)
+    }
+
+    /// The dotted keys in which two configurations differ, with both values.
+    pub fn differences(&self, other: &RunConfig) -> Vec<Difference> {
+        let flat = |config: &RunConfig| {
+            let table = Table::try_from(config).expect("a configuration is representable as TOML");
+            keys::leaves(&table).into_iter().collect::<BTreeMap<_, _>>()
+        };
+        let (ours, theirs) = (flat(self), flat(other));
+        let shown = |value: Option<&Value>| value.map_or("unset".to_owned(), rules::shown);
+        let mut keys: Vec<&String> = ours.keys().chain(theirs.keys()).collect();
+        keys.sort();
+        keys.dedup();
+        keys.into_iter()
+            .map(|key| (key, ours.get(key), theirs.get(key)))
+            .filter(|(_, ours, theirs)| ours != theirs)
+            .map(|(key, ours, theirs)| Difference {
+                key: key.clone(),
+                ours: shown(ours),
+                theirs: shown(theirs),
+            })
+            .collect()
+    }
+}
+
+/// Checks a value of a run by the option that it was chosen from.
+fn check_range(
+    catalogue: &Catalogue,
+    key: &str,
+    value: &Value,
+    origin: &str,
+) -> Result<(), ConfigError> {
+    let schema = catalogue.schema();
+    match key {
+        "eta" => schema.check_as("experiment.etas", key, value, origin),
+        "seed" => schema.check_as("experiment.seeds", key, value, origin),
+        "method" => schema.check_as("experiment.methods", key, value, origin),
+        _ => schema.check_range(key, value, origin),
+    }
+}
+
+/// The options of the run's method, checked; an absent one has its default.
+fn options(catalogue: &Catalogue, run: &RunConfig, origin: &str) -> Result<Table, ConfigError> {
+    let section = format!("method.{}", run.method);
+    for (key, value) in dotted_leaves(&run.options) {
+        catalogue.schema().check(&format!("{section}.{key}"), &value, origin)?;
+    }
+    let defaults = keys::at(&catalogue.schema().table, &section).and_then(Value::as_table);
+    let mut options = defaults.cloned().unwrap_or_default();
+    keys::merge(&mut options, &run.options);
+    Ok(options)
+}
+
+/// A key that two configurations do not agree on.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Difference {
+    /// The dotted key.
+    pub key: String,
+    /// Its value here.
+    pub ours: String,
+    /// Its value there.
+    pub theirs: String,
+}

@@ -1,0 +1,334 @@
+//! Plays for the figures: what [`super`] describes, collected step by step.
+
+use super::{
+    BINS_PER_METRE, BUDGET_CLASSES, BudgetByTime, CellData, Deviations, FigureData, PlaneData,
+    ShiftMap, StoredEpisode, WorldData,
+};
+use crate::exact::yardstick::Solvable;
+use crate::experiment::artefacts::{Chance, SCHEMA};
+use crate::experiment::evaluation::Contestants;
+use crate::experiment::failure::RunError;
+use crate::game::returns::ReturnSoFar;
+use crate::learn::method::Arena;
+use crate::learn::play::Watcher;
+use crate::learn::policy::{Draw, Mode, Nominal};
+use crate::learn::vector_game::VectorGame;
+use lava_envs::{End, Scene, World};
+
+/// Stored episodes of each kind of chance: the first ones.
+const STORED: usize = 6;
+/// Further stored episodes that end in lava, the first ones among the others.
+const STORED_LAVA: usize = 2;
+/// Nominal episodes that are searched for them.
+const NOMINAL: u64 = 5_000;
+/// Trajectories in the plane.
+const TRAJECTORIES: usize = 20;
+/// Bins of the remaining budget per unit of log eta.
+const BUDGET_BINS: f64 = 200.0;
+
+/// A remaining budget above eta to this power counts as that: where delta falls towards 0 it grows
+/// without bound.
+const MOST_LEFT: f64 = 4.0;
+
+/// Plays for all figure data of trained players.
+///
+/// # Errors
+/// If the world refuses its constants or cannot be solved.
+pub fn collect<W: Arena + Solvable>(of: &Contestants<'_, W>) -> Result<FigureData, RunError> {
+    let Contestants { run, constants, players } = of;
+    let episodes = run.evaluation.figure_episodes;
+    let scene = W::new(constants, 1)?.scene();
+    let mut nominal = Collector::new(of, Chance::Nominal, None);
+    // Nominal episodes carry the antagonist's likelihood ratios of what happens.
+    let shown = NOMINAL.min(episodes);
+    match players.opponent() {
+        Some(mut shadow) => {
+            of.play_episodes(Mode::Greedy, shadow.as_mut(), Draw::Nominal, shown, &mut nominal)?
+        }
+        None => of.play_episodes(Mode::Greedy, &mut Nominal, Draw::Nominal, shown, &mut nominal)?,
+    };
+    let mut stored: Vec<StoredEpisode> = nominal.stored().cloned().collect();
+    let (mut counts, mut budget) = (None, None);
+    if let Some(mut antagonist) = players.opponent() {
+        let mut perturbed = Collector::new(of, Chance::Antagonist, Some(Counts::new(&scene)));
+        let antagonist = antagonist.as_mut();
+        of.play_episodes(Mode::Greedy, antagonist, Draw::Perturbed, episodes, &mut perturbed)?;
+        stored.extend(perturbed.stored().cloned());
+        budget = Some(perturbed.budgets.summary());
+        counts = perturbed.counts;
+    }
+    let world = if scene.cells {
+        WorldData::Cells(cells(of, counts)?)
+    } else {
+        WorldData::Plane(plane(&nominal.first, counts))
+    };
+    Ok(FigureData { schema: SCHEMA, episodes, world, budget, stored })
+}
+
+/// The figure data of a world of cells.
+fn cells<W: Arena + Solvable>(
+    of: &Contestants<'_, W>,
+    counts: Option<Counts>,
+) -> Result<CellData, RunError> {
+    let learned = counts.and_then(|counts| match counts {
+        Counts::Cells { deviations, .. } => Some(deviations),
+        Counts::Plane { .. } => None,
+    });
+    let mut data =
+        CellData { occupancy: Vec::new(), learned, exact: None, exact_budget: Vec::new() };
+    let (yardstick, policy) = (of.yardstick()?, of.table()?);
+    let exact = yardstick.as_ref().and_then(|yardstick| yardstick.exact());
+    let (Some(exact), Some(policy)) = (exact, &policy) else { return Ok(data) };
+    let rounded_all = |numbers: Vec<f64>| numbers.into_iter().map(rounded).collect();
+    data.occupancy = exact.occupancy_as_intended(policy)?.map(rounded_all).unwrap_or_default();
+    if data.learned.is_some() {
+        let exposure = exact.exposure(of.run.eta.get(), policy)?;
+        let episodes = of.run.evaluation.figure_episodes as f64;
+        let expected = |numbers: &[f64]| numbers.iter().map(|n| rounded(n * episodes)).collect();
+        data.exact = Some(Deviations {
+            visits: expected(&exposure.visits),
+            deviations: expected(&exposure.deviations),
+        });
+        data.exact_budget = rounded_all(exposure.budget);
+    }
+    Ok(data)
+}
+
+/// The figure data of a world in the plane.
+fn plane(nominal: &[StoredEpisode], counts: Option<Counts>) -> PlaneData {
+    let (bins, mut shifts) = match counts {
+        Some(Counts::Plane { bins, classes }) => (bins, classes),
+        _ => ([0, 0], Vec::new()),
+    };
+    for map in &mut shifts {
+        for (bin, &visits) in map.visits.iter().enumerate().filter(|(_, visits)| **visits > 0) {
+            map.shift[bin] = map.shift[bin].map(|sum| rounded(sum / visits as f64));
+            map.divergence[bin] = rounded(map.divergence[bin] / visits as f64);
+        }
+    }
+    let trajectories = nominal.iter().map(|episode| episode.path.clone()).collect();
+    PlaneData { trajectories, bins, shifts }
+}
+
+/// Four decimals are more than a picture shows.
+fn rounded(value: f64) -> f64 {
+    (value * 1e4).round() / 1e4
+}
+
+/// Four significant digits of a likelihood ratio or a budget; what exceeds the range of f32 is clamped,
+/// because JSON has no infinity.
+fn significant(value: f64) -> f64 {
+    let value = value.clamp(1e-38, 1e38);
+    let unit = 10f64.powi(value.log10().floor() as i32 - 3);
+    (value / unit).round() * unit
+}
+
+/// What is counted step by step under the learned antagonist.
+enum Counts {
+    /// By cell.
+    Cells { width: usize, deviations: Deviations },
+    /// Sums over the steps that began in each bin, by class of the remaining budget.
+    Plane { bins: [usize; 2], classes: Vec<ShiftMap> },
+}
+
+/// What was chosen and what happened in one step.
+struct Recorded<W: World> {
+    action: W::Action,
+    outcome: lava_envs::Outcome<W>,
+    ratio: f64,
+}
+
+impl Counts {
+    /// All counts are 0.
+    fn new(scene: &Scene) -> Self {
+        let [width, height] = scene.size;
+        if scene.cells {
+            let none = vec![0.0; (width * height) as usize];
+            let deviations = Deviations { visits: none.clone(), deviations: none };
+            return Counts::Cells { width: width as usize, deviations };
+        }
+        let bins = scene.size.map(|side| (side * BINS_PER_METRE).ceil() as usize);
+        let count = bins[0] * bins[1];
+        let none = ShiftMap {
+            visits: vec![0; count],
+            shift: vec![[0.0; 2]; count],
+            divergence: vec![0.0; count],
+        };
+        Counts::Plane { bins, classes: vec![none; BUDGET_CLASSES] }
+    }
+
+    /// Counts a step that began in `place` with `left` = log eta_t / log eta of the budget.
+    fn add<W: World>(&mut self, place: [f64; 2], left: f64, step: &Recorded<W>) {
+        match self {
+            Counts::Cells { width, deviations } => {
+                let cell = place[1] as usize * *width + place[0] as usize;
+                deviations.visits[cell] += 1.0;
+                if W::intended(step.action).is_some_and(|intended| intended != step.outcome) {
+                    deviations.deviations[cell] += 1.0;
+                }
+            }
+            Counts::Plane { bins, classes } => {
+                let [x, y]: [usize; 2] = std::array::from_fn(|axis| {
+                    ((place[axis] * BINS_PER_METRE) as usize).min(bins[axis] - 1)
+                });
+                let bin = y * bins[0] + x;
+                let class = ((left * BUDGET_CLASSES as f64) as usize).min(BUDGET_CLASSES - 1);
+                let map = &mut classes[class];
+                let [dx, dy] = W::outcome_arrow(step.outcome);
+                map.visits[bin] += 1;
+                map.shift[bin][0] += dx;
+                map.shift[bin][1] += dy;
+                map.divergence[bin] += step.ratio.ln();
+            }
+        }
+    }
+}
+
+/// The watcher of one play.
+struct Collector {
+    chance: Chance,
+    /// 1 / log eta, or 0 at eta = 1.
+    scale: f64,
+    counts: Option<Counts>,
+    budgets: Budgets,
+    /// The episode in each slot.
+    running: Vec<StoredEpisode>,
+    /// The first episodes, by index.
+    first: Vec<StoredEpisode>,
+    /// The first of the others that end in lava, by index.
+    lava: Vec<StoredEpisode>,
+}
+
+impl Collector {
+    fn new<W: World>(of: &Contestants<'_, W>, chance: Chance, counts: Option<Counts>) -> Self {
+        let eta = of.run.eta;
+        Collector {
+            chance,
+            scale: if eta.is_neutral() { 0.0 } else { 1.0 / eta.get().ln() },
+            counts,
+            budgets: Budgets::default(),
+            running: Vec::new(),
+            first: Vec::new(),
+            lava: Vec::new(),
+        }
+    }
+
+    fn stored(&self) -> impl Iterator<Item = &StoredEpisode> {
+        self.first.iter().take(STORED).chain(&self.lava)
+    }
+
+    /// Keeps the episode that has ended in the slot, if it is one to be stored.
+    fn keep(&mut self, slot: usize) {
+        let episode = &self.running[slot];
+        let (list, room) = if episode.index < TRAJECTORIES as u64 {
+            (&mut self.first, TRAJECTORIES)
+        } else if episode.end == End::Lava {
+            (&mut self.lava, STORED_LAVA)
+        } else {
+            return;
+        };
+        let place = list.partition_point(|kept| kept.index < episode.index);
+        list.insert(place, episode.clone());
+        list.truncate(room);
+    }
+}
+
+impl<W: World> Watcher<W> for Collector {
+    fn before(&mut self, world: &W, slot: usize) {
+        if self.running.len() <= slot {
+            let none = StoredEpisode {
+                chance: self.chance,
+                index: 0,
+                end: End::Timeout,
+                value: 0.0,
+                path: Vec::new(),
+                actions: Vec::new(),
+                outcomes: Vec::new(),
+                ratios: Vec::new(),
+                budgets: Vec::new(),
+            };
+            self.running.resize(slot + 1, none);
+        }
+        let episode = &mut self.running[slot];
+        if world.time(slot) == 0 {
+            episode.path.clear();
+            episode.actions.clear();
+            episode.outcomes.clear();
+            episode.ratios.clear();
+            episode.budgets.clear();
+            episode.path.push(world.position(slot).map(rounded));
+        }
+    }
+
+    fn after(&mut self, game: &VectorGame<W>, slot: usize, index: usize, so_far: &ReturnSoFar) {
+        let time = self.running[slot].actions.len();
+        let step = game.steps[slot];
+        let recorded = Recorded::<W> {
+            action: game.actions[slot],
+            outcome: game.outcomes[slot],
+            ratio: game.ratios[slot],
+        };
+        let before = game.budgets_before[slot].get();
+        if let Some(counts) = &mut self.counts {
+            let left = (before.ln() * self.scale).min(MOST_LEFT);
+            self.budgets.add(time, left);
+            counts.add(self.running[slot].path[time], left, &recorded);
+        }
+        let episode = &mut self.running[slot];
+        episode.index = index as u64;
+        episode.path.push(game.world.position(slot).map(rounded));
+        episode.actions.push(W::action_arrow(recorded.action).map(rounded));
+        episode.outcomes.push(W::outcome_arrow(recorded.outcome).map(rounded));
+        episode.ratios.push(significant(recorded.ratio));
+        episode.budgets.push(significant(before));
+        if let Some(end) = step.end {
+            episode.end = end;
+            episode.value = rounded(so_far.value);
+            episode.budgets.push(significant(game.budgets[slot].get()));
+            self.keep(slot);
+        }
+    }
+}
+
+/// log eta_t / log eta by time, as sums and histograms.
+#[derive(Default)]
+struct Budgets {
+    sums: Vec<f64>,
+    histograms: Vec<Vec<u64>>,
+}
+
+impl Budgets {
+    fn add(&mut self, time: usize, left: f64) {
+        if self.sums.len() <= time {
+            self.sums.resize(time + 1, 0.0);
+            self.histograms.resize(time + 1, Vec::new());
+        }
+        self.sums[time] += left;
+        let histogram = &mut self.histograms[time];
+        let bin = (left * BUDGET_BINS).round() as usize;
+        if histogram.len() <= bin {
+            histogram.resize(bin + 1, 0);
+        }
+        histogram[bin] += 1;
+    }
+
+    fn summary(&self) -> BudgetByTime {
+        let mut summary = BudgetByTime::default();
+        for (sum, histogram) in self.sums.iter().zip(&self.histograms) {
+            let running: u64 = histogram.iter().sum();
+            let quantile = |share: f64| {
+                let mut below = 0;
+                let reached = |count: &u64| {
+                    below += count;
+                    below as f64 >= share * running as f64
+                };
+                histogram.iter().position(reached).unwrap_or_default() as f64 / BUDGET_BINS
+            };
+            summary.running.push(running);
+            summary.mean.push(rounded(sum / running as f64));
+            summary.low.push(rounded(quantile(0.1)));
+            summary.high.push(rounded(quantile(0.9)));
+        }
+        summary
+    }
+}

@@ -1,0 +1,331 @@
+//! The registry: the worlds and methods of the program, by name.
+//!
+//! A world or a method is one file and one line in [`standard`]. A program of your own lists its own
+//! with [`crate::registry!`] and hands them to [`crate::cli::main`]; see `examples/windy_corridor.rs`.
+
+use super::artefacts::{Chance, Play};
+use super::config::{Catalogue, MethodInfo, RunConfig, WorldConstants, WorldInfo};
+use super::evaluation::{self, Contestants};
+use super::failure::RunError;
+use super::run;
+use super::runner::Report;
+use super::steps::{self, Format};
+use super::stop::Stop;
+use crate::exact::yardstick::{Answer, Options, Solvable};
+use crate::files::{LARGEST_FILE, read_at_most};
+use crate::game::returns::ReturnLaw;
+use crate::learn::family::Perturbed;
+use crate::learn::method::{Arena, MethodEntry, Players};
+use crate::learn::policy::Mode;
+use lava_envs::{Scene, World};
+use std::io::Write;
+use std::path::Path;
+use std::sync::LazyLock;
+
+/// Worlds and methods, each with a line.
+///
+/// ```
+/// use cvar_game::learn::methods::{Game, Uniform};
+/// use lava_envs::LavaGrid;
+///
+/// let registry = cvar_game::registry! { worlds: LavaGrid; methods: Game, Uniform };
+/// assert_eq!(registry.worlds().collect::<Vec<_>>(), ["lava-grid"]);
+/// ```
+#[macro_export]
+macro_rules! registry {
+    (worlds: $($world:ty),+ $(,)?; methods: $($method:ty),+ $(,)?) => {
+        $crate::registry!(@worlds [$($world),+] [$($method),+])
+    };
+    // The product of the two lists, a world at a time.
+    (@worlds [$($world:ty),+] $methods:tt) => {
+        $crate::experiment::registry::Registry::new(vec![
+            $($crate::registry!(@world $world, $methods)),+
+        ])
+    };
+    (@world $world:ty, [$($method:ty),+]) => {
+        Box::new(
+            $crate::experiment::registry::WorldEntry::<$world>::new()
+                $(.with::<$method>())+
+        )
+    };
+}
+
+/// The worlds and methods of this program.
+pub fn standard() -> &'static Registry {
+    use crate::learn::methods::{Game, Uniform};
+    use lava_envs::{LavaGrid, LavaPoint};
+    static STANDARD: LazyLock<Registry> = LazyLock::new(|| {
+        crate::registry! {
+            worlds: LavaGrid, LavaPoint;
+            methods: Game, Uniform
+        }
+    });
+    &STANDARD
+}
+
+/// The worlds and methods of a program.
+pub struct Registry {
+    worlds: Vec<Box<dyn Entry>>,
+    catalogue: Catalogue,
+}
+
+impl Registry {
+    /// The registry of these worlds, for [`crate::registry!`].
+    ///
+    /// # Panics
+    /// If the annotated defaults of a world or a method are not valid.
+    pub fn new(worlds: Vec<Box<dyn Entry>>) -> Self {
+        let infos = worlds.iter().map(|world| world.info()).collect();
+        let methods = worlds.first().map_or(Vec::new(), |world| world.methods());
+        let mut families: Vec<&str> = worlds.iter().flat_map(|world| world.families()).collect();
+        families.sort_unstable();
+        families.dedup();
+        Registry { catalogue: Catalogue::new(infos, methods, families), worlds }
+    }
+
+    /// The part of the worlds and methods in configurations.
+    pub fn catalogue(&self) -> &Catalogue {
+        &self.catalogue
+    }
+
+    /// The names of the worlds.
+    pub fn worlds(&self) -> impl Iterator<Item = &'static str> {
+        self.catalogue.worlds.iter().map(|world| world.name)
+    }
+
+    /// The world of these constants.
+    ///
+    /// # Errors
+    /// If this program has no world of that name.
+    pub fn world(&self, of: &WorldConstants) -> Result<&dyn Entry, RunError> {
+        let name = of.world.as_str();
+        self.named(name).ok_or_else(|| RunError::UnknownWorld(name.to_owned()))
+    }
+
+    /// The world of a name, if there is one.
+    pub fn named(&self, name: &str) -> Option<&dyn Entry> {
+        self.worlds.iter().find(|world| world.name() == name).map(Box::as_ref)
+    }
+}
+
+/// What to play with a finished run.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Request {
+    /// Who decides the law of chance.
+    pub chance: Chance,
+    /// Episodes of each play, if not those of the run's configuration.
+    pub episodes: Option<u64>,
+    /// Seed of the streams, if not that of the run's configuration.
+    pub seed: Option<u64>,
+}
+
+impl Request {
+    fn apply(&self, run: &RunConfig) -> RunConfig {
+        let mut run = run.clone();
+        run.evaluation.episodes = self.episodes.unwrap_or(run.evaluation.episodes);
+        run.evaluation.seed = self.seed.unwrap_or(run.evaluation.seed);
+        run
+    }
+}
+
+/// A world with its methods, whatever their types.
+pub trait Entry: Send + Sync {
+    /// The world's name.
+    fn name(&self) -> &'static str;
+
+    /// The world's part in configurations.
+    fn info(&self) -> WorldInfo;
+
+    /// The methods' part in configurations.
+    fn methods(&self) -> Vec<MethodInfo>;
+
+    /// The kinds of families of perturbations that fit the world.
+    fn families(&self) -> Vec<&'static str>;
+
+    /// Carries out a run, see [`run::execute`].
+    ///
+    /// # Errors
+    /// If training fails or an artefact cannot be written.
+    fn execute(
+        &self,
+        run: &RunConfig,
+        folder: &Path,
+        stop: &Stop,
+        report: &mut dyn FnMut(Report),
+    ) -> Result<(), RunError>;
+
+    /// Plays the finished run in `folder` again; writes nothing.
+    ///
+    /// # Errors
+    /// If the folder holds no weights of the run or the request makes no sense for it.
+    fn evaluate(
+        &self,
+        run: &RunConfig,
+        folder: &Path,
+        request: &Request,
+    ) -> Result<Vec<Play>, RunError>;
+
+    /// Writes every step of episodes of the finished run in `folder`.
+    ///
+    /// # Errors
+    /// As [`Entry::evaluate`], and if the output accepts no more.
+    fn rollout(
+        &self,
+        run: &RunConfig,
+        folder: &Path,
+        request: &Request,
+        rows: (Mode, Format),
+        output: &mut dyn Write,
+    ) -> Result<(), RunError>;
+
+    /// All that is known of the optimum at a budget.
+    ///
+    /// # Errors
+    /// If nothing is known, or it cannot be computed.
+    fn solve(
+        &self,
+        constants: &WorldConstants,
+        gamma: f64,
+        eta: f64,
+        options: &Options,
+    ) -> Result<Box<dyn Answer>, RunError>;
+
+    /// What figures draw of the world; `None` if the constants are not its own.
+    fn scene(&self, constants: &toml::Table) -> Option<Scene>;
+
+    /// The laws of the return of the policies that are optimal at some budgets, where the world can be
+    /// solved exactly.
+    fn frontier(&self, constants: &toml::Table, gamma: f64, etas: &[f64])
+    -> Option<Vec<ReturnLaw>>;
+}
+
+/// A world with its methods.
+pub struct WorldEntry<W: Arena> {
+    methods: Vec<MethodEntry<W>>,
+}
+
+impl<W: Arena> Default for WorldEntry<W> {
+    fn default() -> Self {
+        WorldEntry { methods: Vec::new() }
+    }
+}
+
+impl<W: Arena> WorldEntry<W> {
+    /// The world, without methods.
+    pub fn new() -> Self {
+        WorldEntry::default()
+    }
+
+    /// The same with a method more.
+    #[must_use]
+    pub fn with<M: crate::learn::method::Method>(mut self) -> Self {
+        self.methods.push(MethodEntry::of::<M>());
+        self
+    }
+
+    fn method(&self, run: &RunConfig) -> Result<&MethodEntry<W>, RunError> {
+        let found = self.methods.iter().find(|method| method.name == run.method.as_str());
+        found.ok_or_else(|| RunError::UnknownMethod(run.method.to_string()))
+    }
+
+    /// The trained players of the finished run in `folder`.
+    fn load(&self, run: &RunConfig, folder: &Path) -> Result<Box<dyn Players<W>>, RunError> {
+        let path = folder.join("final.safetensors");
+        let bytes = read_at_most(&path, LARGEST_FILE).map_err(RunError::file(&path))?;
+        let mut players = (self.method(run)?.players)(&run.setting());
+        players.load(&bytes)?;
+        Ok(players)
+    }
+}
+
+fn constants<W: World>(of: &WorldConstants) -> Result<W::Constants, RunError> {
+    Ok(of.of::<W>()?)
+}
+
+impl<W: Arena + Solvable> Entry for WorldEntry<W> {
+    fn name(&self) -> &'static str {
+        W::NAME
+    }
+
+    fn info(&self) -> WorldInfo {
+        WorldInfo::of::<W>(self.methods.iter().map(|of| (of.name, of.check)).collect())
+    }
+
+    fn methods(&self) -> Vec<MethodInfo> {
+        let info = |of: &MethodEntry<W>| MethodInfo { name: of.name, defaults: of.defaults };
+        self.methods.iter().map(info).collect()
+    }
+
+    fn families(&self) -> Vec<&'static str> {
+        W::Law::FAMILIES.iter().map(|family| family.kind).collect()
+    }
+
+    fn execute(
+        &self,
+        run: &RunConfig,
+        folder: &Path,
+        stop: &Stop,
+        report: &mut dyn FnMut(Report),
+    ) -> Result<(), RunError> {
+        let constants = constants::<W>(&run.env)?;
+        run::execute(self.method(run)?, &constants, run, folder, stop, report)
+    }
+
+    fn evaluate(
+        &self,
+        run: &RunConfig,
+        folder: &Path,
+        request: &Request,
+    ) -> Result<Vec<Play>, RunError> {
+        let (run, constants) = (request.apply(run), constants::<W>(&run.env)?);
+        let players = self.load(&run, folder)?;
+        let contestants = Contestants { run: &run, constants: &constants, players: &*players };
+        evaluation::plays(&contestants, request.chance)
+    }
+
+    fn rollout(
+        &self,
+        run: &RunConfig,
+        folder: &Path,
+        request: &Request,
+        (mode, format): (Mode, Format),
+        output: &mut dyn Write,
+    ) -> Result<(), RunError> {
+        let (mut run, constants) = (request.apply(run), constants::<W>(&run.env)?);
+        let slots = &mut run.evaluation.parallel_episodes;
+        *slots = (*slots).min(steps::MOST_PARALLEL);
+        let players = self.load(&run, folder)?;
+        let contestants = Contestants { run: &run, constants: &constants, players: &*players };
+        steps::write_rollout(&contestants, mode, request.chance, format, output)
+    }
+
+    fn solve(
+        &self,
+        of: &WorldConstants,
+        gamma: f64,
+        eta: f64,
+        options: &Options,
+    ) -> Result<Box<dyn Answer>, RunError> {
+        let yardstick = W::yardstick(&constants::<W>(of)?, gamma, options)?;
+        let answer = yardstick.map(|yardstick| yardstick.answer(eta)).transpose()?.flatten();
+        answer.ok_or_else(|| RunError::NoYardstick(W::NAME.to_owned()))
+    }
+
+    fn scene(&self, constants: &toml::Table) -> Option<Scene> {
+        let constants = constants.clone().try_into().ok()?;
+        W::new(&constants, 1).ok().map(|world| world.scene())
+    }
+
+    fn frontier(
+        &self,
+        constants: &toml::Table,
+        gamma: f64,
+        etas: &[f64],
+    ) -> Option<Vec<ReturnLaw>> {
+        let constants = constants.clone().try_into().ok()?;
+        let yardstick = W::yardstick(&constants, gamma, &Options::default()).ok()??;
+        yardstick.exact()?; // a curve of sampled laws would have their errors
+        let law = |eta: &f64| yardstick.optimal_law(*eta).ok()?;
+        Some(etas.iter().filter_map(law).collect())
+    }
+}

@@ -1,0 +1,285 @@
+//! The antagonist of the game: a PPO player whose policy IS the perturbed law of chance, with any family
+//! of perturbations that fits the law.
+//!
+//! The families of each law are listed once, in its [`Perturbed`] implementation below: a new
+//! family is one file in `game` and one line here. The rest of the program uses an antagonist through
+//! [`Antagonist`], whatever its family.
+
+use super::budget_sensitivity::{BudgetSensitivity, LARGEST, STEP};
+use super::device::Device;
+use super::head::{AntagonistHead, Head};
+use super::network::Network;
+use super::options::{FamilyOptions, PlayerOptions};
+use super::policy::{Draw, Streams};
+use super::ppo::{Losses, Player, Rates};
+use super::state::{PlayerState, Unfit};
+use super::trajectories::Trajectories;
+use crate::game::budget::Budget;
+use crate::game::finite::FiniteFamily;
+use crate::game::gaussian::GaussianFamily;
+use crate::game::perturbation::{Family, Perturbation};
+use lava_envs::random::ChaCha8Rng;
+use lava_envs::{FiniteLaw, GaussianLaw, Law};
+use rand::RngExt;
+use rand_distr::StandardNormal;
+use std::fmt::Debug;
+
+/// What an antagonist records: the nominal law and the budget it acted within, and the outcome.
+pub type Played<L> = Trajectories<(L, Budget), <L as Law>::Outcome>;
+
+/// A law of chance that an antagonist can reweight.
+pub trait Perturbed: Law {
+    /// The families that fit this law, the default first.
+    const FAMILIES: &'static [FamilyEntry<Self>];
+}
+
+impl<const N: usize> Perturbed for FiniteLaw<N> {
+    const FAMILIES: &'static [FamilyEntry<Self>] = &[FamilyEntry::of::<FiniteFamily<N>>()];
+}
+
+impl Perturbed for GaussianLaw {
+    const FAMILIES: &'static [FamilyEntry<Self>] = &[FamilyEntry::of::<GaussianFamily>()];
+}
+
+/// A family that can be chosen by its name.
+#[derive(Debug)]
+pub struct FamilyEntry<L: Law> {
+    /// `train.family.kind`.
+    pub kind: &'static str,
+    antagonist: fn(&FamilyOptions, Sizes<'_>) -> Box<dyn Antagonist<L>>,
+}
+
+/// How large an antagonist's networks are, and where they are.
+struct Sizes<'a> {
+    inputs: usize,
+    hidden: usize,
+    device: Device,
+    random: &'a mut ChaCha8Rng,
+}
+
+/// A family that the options can select.
+pub trait Named: Family + Send + 'static {
+    /// `train.family.kind`.
+    const KIND: &'static str;
+
+    /// The family with these options.
+    fn with(options: &FamilyOptions) -> Self;
+}
+
+impl<const N: usize> Named for FiniteFamily<N> {
+    const KIND: &'static str = "softmax";
+
+    fn with(_: &FamilyOptions) -> Self {
+        FiniteFamily
+    }
+}
+
+impl Named for GaussianFamily {
+    const KIND: &'static str = "bumps";
+
+    fn with(options: &FamilyOptions) -> Self {
+        GaussianFamily {
+            bumps: options.count,
+            center_bound: options.center,
+            curvature_bound: options.curvature,
+        }
+    }
+}
+
+impl<L: Law> FamilyEntry<L> {
+    const fn of<F: Named<Law = L>>() -> Self {
+        FamilyEntry {
+            kind: F::KIND,
+            antagonist: |options, Sizes { inputs, hidden, device, random }| {
+                let head = AntagonistHead(F::with(options));
+                Box::new(Player::new(head, inputs, hidden, device, random))
+            },
+        }
+    }
+}
+
+/// The family that the options select; `kind = "auto"` is the law's default.
+///
+/// # Errors
+/// If no family of that name fits the law; the error names those that do.
+pub fn family<L: Perturbed>(options: &FamilyOptions) -> Result<&'static FamilyEntry<L>, String> {
+    let kind = options.kind.as_str();
+    let found = L::FAMILIES.iter().find(|family| kind == "auto" || family.kind == kind);
+    found.ok_or_else(|| {
+        let kinds: Vec<String> = L::FAMILIES.iter().map(|of| format!("{:?}", of.kind)).collect();
+        format!(
+            "train.family.kind = {kind:?} does not fit the law of chance of this world; use {} or \
+             \"auto\"",
+            kinds.join(" or ")
+        )
+    })
+}
+
+/// A fresh antagonist that sees `inputs` numbers.
+///
+/// # Panics
+/// If no family of that name fits the law; [`family`] reports that.
+pub fn antagonist<L: Perturbed>(
+    options: &FamilyOptions,
+    inputs: usize,
+    hidden: usize,
+    device: Device,
+    random: &mut ChaCha8Rng,
+) -> Box<dyn Antagonist<L>> {
+    let entry = family::<L>(options).expect("the configuration was checked");
+    (entry.antagonist)(options, Sizes { inputs, hidden, device, random })
+}
+
+/// What an antagonist acts on and writes to; slices have an entry per slot.
+pub struct Reweighting<'a, L: Law> {
+    /// Actor outputs, shape `[k, slots]`; `None` draws the perturbation's parameters from N(0, 1).
+    pub outputs: Option<&'a [f32]>,
+    /// Nominal laws P_t.
+    pub laws: &'a [L],
+    /// Remaining budgets eta_t.
+    pub budgets: &'a [Budget],
+    /// The law that outcomes are drawn from.
+    pub draw: Draw,
+    /// Random streams.
+    pub streams: &'a mut [Streams],
+    /// Receives the outcomes.
+    pub outcomes: &'a mut Vec<L::Outcome>,
+    /// Receives their likelihood ratios.
+    pub ratios: &'a mut [f64],
+    /// Receives max |`E_P[delta_t]` - 1|, if it is requested.
+    pub normalisation_error: Option<&'a mut f64>,
+}
+
+/// An antagonist of any family.
+pub trait Antagonist<L: Law>: Debug + Send {
+    /// Actor and critic.
+    fn network(&self) -> &Network;
+
+    /// The same, to be changed.
+    fn network_mut(&mut self) -> &mut Network;
+
+    /// Draws outcomes from perturbed laws.
+    fn reweight(&self, of: Reweighting<'_, L>);
+
+    /// How its own spending changes its value along the recorded trajectories. `with_more_budget` turns inputs
+    /// into those that it would see with exp(the second argument) times the budget.
+    fn budget_sensitivity(
+        &self,
+        played: &Played<L>,
+        with_more_budget: &dyn Fn(&mut [f32], f64),
+    ) -> BudgetSensitivity;
+
+    /// A PPO update, see [`Player::update`].
+    fn update(
+        &mut self,
+        played: &Played<L>,
+        sensitivity: Option<&BudgetSensitivity>,
+        gamma: f64,
+        options: &PlayerOptions,
+        rates: Rates,
+        random: &mut ChaCha8Rng,
+    ) -> Losses;
+
+    /// See [`Player::not_finite`].
+    fn not_finite(&self) -> Option<&'static str>;
+
+    /// See [`Player::state`].
+    fn state(&self) -> PlayerState;
+
+    /// See [`Player::restore`].
+    ///
+    /// # Errors
+    /// If the state is of another network or not finite.
+    fn restore(&mut self, state: PlayerState) -> Result<(), Unfit>;
+}
+
+impl<F: Family + Send + 'static> Antagonist<F::Law> for Player<AntagonistHead<F>> {
+    fn network(&self) -> &Network {
+        &self.network
+    }
+
+    fn network_mut(&mut self) -> &mut Network {
+        &mut self.network
+    }
+
+    fn reweight(&self, of: Reweighting<'_, F::Law>) {
+        let mut parameters = Vec::new();
+        let mut error: f64 = 0.0;
+        for (slot, (law, &budget)) in of.laws.iter().zip(of.budgets).enumerate() {
+            let random = &mut of.streams[slot].outcomes;
+            match of.outputs {
+                Some(outputs) => self.parameters_in(outputs, slot, &mut parameters),
+                None => {
+                    parameters.clear();
+                    let count = self.head.outputs();
+                    parameters.extend((0..count).map(|_| random.sample::<f64, _>(StandardNormal)));
+                }
+            }
+            let perturbation = self.head.0.perturbation(&parameters, law, budget);
+            if of.normalisation_error.is_some() {
+                error = error.max(perturbation.normalisation_error());
+            }
+            let outcome = match of.draw {
+                Draw::Nominal => law.sample(random),
+                Draw::Perturbed => perturbation.sample(random),
+            };
+            of.outcomes.push(outcome);
+            of.ratios[slot] = perturbation.likelihood_ratio(outcome);
+        }
+        if let Some(largest) = of.normalisation_error {
+            *largest = largest.max(error);
+        }
+    }
+
+    fn budget_sensitivity(
+        &self,
+        played: &Played<F::Law>,
+        with_more_budget: &dyn Fn(&mut [f32], f64),
+    ) -> BudgetSensitivity {
+        let steps = played.rewards.len();
+        let mut inputs = played.inputs.clone();
+        let after = self.network.shape().width() * steps;
+        let (mut values, mut richer, mut outputs) = (Vec::new(), Vec::new(), Vec::new());
+        self.network.values(&inputs[after..], &mut values);
+        with_more_budget(&mut inputs, STEP);
+        self.network.values(&inputs[after..], &mut richer);
+        self.network.act(&inputs[..after], &mut outputs);
+        let mut parameters = Vec::new();
+        let elasticity = |i: usize| {
+            self.parameters_in(&outputs, i, &mut parameters);
+            let (law, budget) = played.given[i];
+            let budget = Budget::remaining(budget.get() * STEP.exp()).unwrap_or(budget);
+            let log = self.head.log_probability(&parameters, &(law, budget), &played.choices[i]);
+            (((log - played.log_probabilities[i]) / STEP) as f32).clamp(-LARGEST, LARGEST)
+        };
+        let slope = |(richer, value): (&f32, &f32)| (richer - value) / STEP as f32;
+        BudgetSensitivity {
+            elasticities: (0..steps).map(elasticity).collect(),
+            last: richer.iter().zip(&values).map(slope).collect(),
+        }
+    }
+
+    fn update(
+        &mut self,
+        played: &Played<F::Law>,
+        sensitivity: Option<&BudgetSensitivity>,
+        gamma: f64,
+        options: &PlayerOptions,
+        rates: Rates,
+        random: &mut ChaCha8Rng,
+    ) -> Losses {
+        Player::update(self, played, sensitivity, gamma, options, rates, random)
+    }
+
+    fn not_finite(&self) -> Option<&'static str> {
+        Player::not_finite(self)
+    }
+
+    fn state(&self) -> PlayerState {
+        Player::state(self)
+    }
+
+    fn restore(&mut self, state: PlayerState) -> Result<(), Unfit> {
+        Player::restore(self, state)
+    }
+}

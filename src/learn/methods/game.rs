@@ -1,0 +1,272 @@
+//! The method `game`: Algorithm 1 of the paper. The two players are updated in turn, each on a fresh
+//! rollout. At eta = 1 there is no antagonist, and every turn is the protagonist's.
+
+use crate::game::budget::Eta;
+use crate::learn::family;
+use crate::learn::method::{
+    Arena, Method, Metric, Players, Progress, Setting, TrainError, Training,
+};
+use crate::learn::options::{Adversary, Credit, PlayerOptions, Role, TrainOptions};
+use crate::learn::pair::Pair;
+use crate::learn::policy::Mode;
+use crate::learn::ppo::{Losses, Rates};
+use crate::learn::rollout::{Collector, Terms};
+use crate::learn::state::{TrainingState, Unfit};
+use lava_envs::End;
+use lava_envs::random::{ChaCha8Rng, Purpose, position, stream, stream_from};
+
+/// The method `game`.
+#[derive(Debug, Clone, Copy)]
+pub struct Game;
+
+impl Method for Game {
+    const NAME: &'static str = "game";
+
+    const METRICS: &'static [Metric] = &[
+        Metric { column: "budget", tag: "charts/budget" },
+        Metric { column: "mean_return", tag: "charts/episodic_return" },
+        Metric { column: "goal", tag: "charts/goal" },
+        Metric { column: "lava", tag: "charts/lava" },
+        Metric { column: "learning_rate", tag: "charts/learning_rate" },
+        Metric { column: "policy_loss", tag: "losses/policy_loss" },
+        Metric { column: "value_loss", tag: "losses/value_loss" },
+        Metric { column: "entropy", tag: "losses/entropy" },
+        Metric { column: "approx_kl", tag: "losses/approx_kl" },
+        Metric { column: "clip_fraction", tag: "losses/clipfrac" },
+        Metric { column: "gradient_norm", tag: "losses/gradient_norm" },
+        Metric { column: "explained_variance", tag: "losses/explained_variance" },
+        Metric { column: "budget_use", tag: "charts/budget_use" },
+    ];
+
+    fn check<W: Arena>(options: &TrainOptions, _: &toml::Table) -> Result<(), String> {
+        if options.credit == Credit::Executed && !W::OUTCOMES_ARE_ACTIONS {
+            return Err(format!(
+                "train.credit = \"executed\" needs a world in which chance decides an action, which \
+                 {0} is not; set it only for the other worlds, by env.WORLD.train.credit",
+                W::NAME
+            ));
+        }
+        family::family::<W::Law>(&options.family).map(|_| ())
+    }
+
+    fn begin<'a, W: Arena>(world: W, setting: &'a Setting<'a>) -> Box<dyn Training<W> + 'a> {
+        Box::new(GameTraining::new(world, setting))
+    }
+
+    fn players<W: Arena>(setting: &Setting<'_>) -> Box<dyn Players<W>> {
+        Box::new(Pair::<W>::new(setting))
+    }
+}
+
+/// Training of a pair, update by update.
+pub struct GameTraining<'a, W: Arena> {
+    setting: &'a Setting<'a>,
+    turns: Vec<Turn>,
+    /// Updates done.
+    done: usize,
+    /// The players.
+    pub pair: Pair<W>,
+    collector: Collector<W>,
+    minibatches: ChaCha8Rng,
+}
+
+impl<'a, W: Arena> GameTraining<'a, W> {
+    /// Training from its beginning, on `world`, whose slots are the parallel episodes.
+    pub fn new(world: W, setting: &'a Setting<'a>) -> Self {
+        GameTraining {
+            setting,
+            turns: schedule(setting.options, setting.eta),
+            done: 0,
+            pair: Pair::new(setting),
+            collector: Collector::new(world, setting),
+            minibatches: stream(setting.seed, Purpose::Minibatches, 0),
+        }
+    }
+
+    /// A rollout and the update of one player on it.
+    fn turn(&mut self, turn: &Turn) -> Losses {
+        let Setting { gamma, options, .. } = *self.setting;
+        let GameTraining { pair, collector, minibatches, .. } = self;
+        collector.collect(pair, Terms { eta: turn.budget, mode: turn.mode }, options);
+        match (turn.role, &mut pair.antagonist) {
+            (Role::Antagonist, Some(antagonist)) => {
+                let played = &collector.antagonist;
+                let observation = pair.observation;
+                let more = |inputs: &mut [f32], by| observation.with_more_budget::<W>(inputs, by);
+                let sensitivity = options
+                    .budget_sensitivity
+                    .then(|| antagonist.budget_sensitivity(played, &more));
+                let (sensitivity, its) = (sensitivity.as_ref(), &options.antagonist);
+                antagonist.update(played, sensitivity, gamma, its, turn.rates, minibatches)
+            }
+            _ => {
+                let (played, its) = (&collector.protagonist, &options.protagonist);
+                pair.protagonist.update(played, None, gamma, its, turn.rates, minibatches)
+            }
+        }
+    }
+
+    /// The first quantity of a player that is not a finite number after its update.
+    fn not_finite(&self, role: Role, losses: &Losses) -> Option<&'static str> {
+        losses.not_finite().or_else(|| match (role, &self.pair.antagonist) {
+            (Role::Antagonist, Some(antagonist)) => antagonist.not_finite(),
+            _ => self.pair.protagonist.not_finite(),
+        })
+    }
+
+    /// All that the later updates depend on.
+    pub fn state(&self) -> TrainingState<W::Snapshot> {
+        TrainingState {
+            update: self.updates(),
+            minibatches: position(&self.minibatches),
+            protagonist: self.pair.protagonist.state(),
+            antagonist: self.pair.antagonist.as_ref().map(|antagonist| antagonist.state()),
+            games: self.collector.state(),
+        }
+    }
+
+    /// Continues from a state of training with the same setting.
+    ///
+    /// # Errors
+    /// If the state is of another setting; part of it may be in place then.
+    pub fn restore(&mut self, state: TrainingState<W::Snapshot>) -> Result<(), Unfit> {
+        let done = usize::try_from(state.update).ok().filter(|&done| done <= self.turns.len());
+        let done = done.ok_or(Unfit("the schedule's"))?;
+        self.pair.protagonist.restore(state.protagonist)?;
+        match (&mut self.pair.antagonist, state.antagonist) {
+            (Some(antagonist), Some(state)) => antagonist.restore(state)?,
+            (None, None) => {}
+            _ => return Err(Unfit("a player's")),
+        }
+        let seed = self.setting.seed;
+        self.collector.restore(&state.games, seed)?;
+        self.minibatches = stream_from(seed, Purpose::Minibatches, 0, state.minibatches);
+        self.done = done;
+        Ok(())
+    }
+}
+
+impl<W: Arena> Training<W> for GameTraining<'_, W> {
+    fn update(&mut self) -> Result<Option<Progress>, TrainError> {
+        let Some(&turn) = self.turns.get(self.done) else { return Ok(None) };
+        let losses = self.turn(&turn);
+        let (update, player) = (turn.update, turn.role.name());
+        if let Some(quantity) = self.not_finite(turn.role, &losses) {
+            return Err(TrainError::NotFinite { update, player, quantity });
+        }
+        self.done += 1;
+        let collector = &self.collector;
+        let mean_return = collector.mean_return();
+        let values = vec![
+            turn.budget.get(),
+            mean_return,
+            collector.share(End::Goal),
+            collector.share(End::Lava),
+            turn.rates.learning_rate,
+            losses.policy_loss,
+            losses.value_loss,
+            losses.entropy,
+            losses.approx_kl,
+            losses.clip_fraction,
+            losses.gradient_norm,
+            losses.explained_variance,
+            collector.budget_use,
+        ];
+        Ok(Some(Progress { update, steps: self.steps(), player, mean_return, values }))
+    }
+
+    fn updates(&self) -> u64 {
+        self.done as u64
+    }
+
+    fn steps(&self) -> u64 {
+        self.updates() * self.setting.options.rollout()
+    }
+
+    fn state(&self) -> Vec<u8> {
+        postcard::to_allocvec(&GameTraining::state(self)).expect("memory takes every byte")
+    }
+
+    fn restore(&mut self, state: &[u8]) -> Result<(), Unfit> {
+        match postcard::take_from_bytes(state) {
+            Ok((state, [])) => GameTraining::restore(self, state),
+            _ => Err(Unfit("the method's")),
+        }
+    }
+
+    fn players(&self) -> &dyn Players<W> {
+        &self.pair
+    }
+}
+
+/// One update of one player.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Turn {
+    /// Index, from 1.
+    pub update: u64,
+    /// Whose turn it is.
+    pub role: Role,
+    /// Budget of the rollout.
+    pub budget: Eta,
+    /// How the protagonist picks its actions in the rollout.
+    pub mode: Mode,
+    /// Rates of the update.
+    pub rates: Rates,
+}
+
+/// All turns of a run: K of the follower, one of the leader, and so on. While the budget is 1, or the
+/// adversary does not learn, every turn is the protagonist's; at the end those of the response to its greedy policy are the
+/// antagonist's. Each player's rates fall linearly over its own turns.
+pub fn schedule(options: &TrainOptions, eta: Eta) -> Vec<Turn> {
+    let updates = options.steps.div_ceil(options.rollout());
+    let round = u64::from(options.follower_updates) + 1;
+    let responds = |update: u64| (updates - update) as f64 <= options.response * updates as f64;
+    let mut played = 0; // turns at a budget above 1
+    let roles: Vec<(Role, Eta)> = (0..updates)
+        .map(|update| {
+            let budget = budget_at(options, eta, update as f64 / updates as f64);
+            if budget.is_neutral() || options.adversary == Adversary::Random {
+                return (Role::Protagonist, budget);
+            }
+            if responds(update) {
+                return (Role::Antagonist, budget);
+            }
+            played += 1;
+            let leads = played % round == 0;
+            (if leads { options.leader } else { options.leader.other() }, budget)
+        })
+        .collect();
+    let count = |wanted: Role| roles.iter().filter(|(role, _)| *role == wanted).count();
+    let totals = [Role::Protagonist, Role::Antagonist].map(count);
+    let mut done = [0usize; 2];
+    let turn = |(update, &(role, budget)): (usize, &(Role, Eta))| {
+        let (player, index): (&PlayerOptions, usize) = match role {
+            Role::Protagonist => (&options.protagonist, 0),
+            Role::Antagonist => (&options.antagonist, 1),
+        };
+        let progress = done[index] as f64 / (totals[index] as f64 - 1.0).max(1.0);
+        done[index] += 1;
+        let between = |first: f64, last: f64| first * (1.0 - progress) + last * progress;
+        let rates = Rates {
+            learning_rate: between(player.learning_rate, player.learning_rate_final),
+            entropy: between(player.entropy, player.entropy_final),
+        };
+        let response = role == Role::Antagonist && responds(update as u64);
+        let mode = if response { Mode::Greedy } else { Mode::Sampled };
+        Turn { update: update as u64 + 1, role, budget, mode, rates }
+    };
+    roles.iter().enumerate().map(turn).collect()
+}
+
+/// The budget at a point of the run in [0, 1): 1 for `budget_wait`, then rising linearly in log eta
+/// for `budget_rise`, then eta.
+fn budget_at(options: &TrainOptions, eta: Eta, progress: f64) -> Eta {
+    let since = progress - options.budget_wait;
+    if since < 0.0 {
+        Eta::NEUTRAL
+    } else if since < options.budget_rise {
+        Eta::new(eta.get().powf(since / options.budget_rise)).unwrap_or(Eta::NEUTRAL)
+    } else {
+        eta
+    }
+}

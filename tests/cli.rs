@@ -1,0 +1,316 @@
+//! The program as its user meets it: answers, exit codes and bad input.
+
+use assert_cmd::Command;
+use std::fs;
+use std::path::Path;
+use tempfile::TempDir;
+
+fn program() -> Command {
+    Command::cargo_bin("cvar-game").unwrap()
+}
+
+/// Standard output of a command that succeeds.
+fn answer(arguments: &[&str]) -> String {
+    let output = program().args(arguments).output().unwrap();
+    let error = String::from_utf8_lossy(&output.stderr);
+    assert!(output.status.success(), "{arguments:?}: {error}");
+    String::from_utf8(output.stdout).unwrap()
+}
+
+/// The one line of standard error of a command that is refused as bad input.
+fn refusal(arguments: &[&str]) -> String {
+    let output = program().args(arguments).output().unwrap();
+    let error = String::from_utf8(output.stderr).unwrap();
+    assert_eq!(output.status.code(), Some(2), "{arguments:?}: {error}");
+    assert!(output.stdout.is_empty(), "{arguments:?} answered");
+    assert_eq!(error.lines().count(), 1, "{arguments:?}: {error}");
+    error
+}
+
+fn config_file(folder: &TempDir, text: &str) -> String {
+    let path = folder.path().join("some.toml");
+    fs::write(&path, text).unwrap();
+    path.to_str().unwrap().to_owned()
+}
+
+#[test]
+fn help_of_the_program_and_of_each_verb_is_there() {
+    assert!(answer(&["--help"]).contains("Examples:"));
+    for verb in ["bench", "train", "evaluate", "exact", "table", "envs", "config"] {
+        assert!(answer(&[verb, "--help"]).contains("Usage: cvar-game"), "{verb}");
+    }
+    assert!(!answer(&["--help"]).contains("worker"), "the workers' verb is not for users");
+}
+
+#[test]
+fn envs_lists_the_worlds_with_their_constants() {
+    let text = answer(&["envs"]);
+    for part in ["# lava-grid:", "slip = 0.05", "# lava-point:", "noise = 1.5", "horizon = 40"] {
+        assert!(text.contains(part), "{part} is missing in {text}");
+    }
+    assert!(!text.contains("train"), "{text}");
+    let json: serde_json::Value = serde_json::from_str(&answer(&["envs", "--json"])).unwrap();
+    assert_eq!(json["lava-grid"]["slip"], 0.05);
+    assert_eq!(json["lava-point"]["lava"]["max"], serde_json::json!([8.0, 2.0]));
+}
+
+#[test]
+fn config_prints_what_resolves_to_itself() {
+    let folder = tempfile::tempdir().unwrap();
+    let printed = answer(&["config", "--env", "lava-point", "--set", "env.noise=2"]);
+    assert!(printed.contains("noise = 2.0") && !printed.contains("lava-grid"), "{printed}");
+    assert!(printed.contains("etas = [1.0, 25.0, 100.0]"), "{printed}");
+    let again = answer(&["config", "--config", &config_file(&folder, &printed)]);
+    assert_eq!(again, printed);
+}
+
+#[test]
+fn exact_solves_the_grid() {
+    let json = answer(&["exact", "--env", "lava-grid", "--eta", "25", "--json"]);
+    let json: serde_json::Value = serde_json::from_str(&json).unwrap();
+    assert_eq!(json["eta"], 25.0);
+    assert!((json["optimal_cvar"].as_f64().unwrap() - 0.2083).abs() < 1e-3, "{json}");
+    assert!(answer(&["exact", "--env", "lava-grid", "--eta", "1"]).contains("lava-grid"));
+}
+
+#[test]
+fn bad_input_is_refused_in_one_line_that_says_what_to_do() {
+    let folder = tempfile::tempdir().unwrap();
+    let good = config_file(&folder, "experiment.seeds = [1]");
+    let out = folder.path().join("out");
+    let out = out.to_str().unwrap();
+    let under_a_file = format!("{good}/out");
+    let grid = ["train", "--out", out, "--env", "lava-grid", "--seed", "1", "--eta"];
+    let train = |rest: &[&'static str]| [&grid[..], rest].concat();
+    let bench =
+        |rest: &[&'static str]| [&["bench", "--out", out, "--config", &good], rest].concat();
+    for (arguments, parts) in [
+        (train(&["0.5"]), ["--eta: eta must be", "at least 1, got 0.5"]),
+        (train(&["-3"]), ["--eta: eta must be", "at least 1, got -3"]),
+        (train(&["nan"]), ["--eta: eta must be", "got NaN"]),
+        (train(&["inf"]), ["--eta: eta must be", "got inf"]),
+        (train(&["1", "--steps", "0"]), ["train.steps = 0 (from --steps)", "at least 1"]),
+        (train(&["1", "--config", "no.toml"]), ["cannot read no.toml", "give the path"]),
+        (train(&["1", "--set", "train.step=1"]), ["train.step (", "did you mean train.steps?"]),
+        (train(&["1", "--set", "steps"]), ["--set steps", "--set key=value"]),
+        (bench(&["--set", "gamma=nan"]), ["gamma = nan (from --set)", "at most 1"]),
+        (bench(&["--set", "experiment.seeds=[1,1]"]), ["experiment.seeds", "duplicates"]),
+        (bench(&["--set", "env.map=..G"]), ["env.lava-grid.map", "write S into one free cell"]),
+        (bench(&["--set", "env.map=S.."]), ["env.lava-grid.map", "write G into a free cell"]),
+        (
+            vec!["bench", "--config", &good, "--out", &under_a_file],
+            ["cannot write to", "choose another folder with --out"],
+        ),
+        (vec!["bench", "--config", "no.toml"], ["cannot read no.toml", "give the path"]),
+        (vec!["table", out], ["cannot read", "check the path"]),
+        (vec!["evaluate", out], ["holds no run", "give the folder of one"]),
+        (vec!["exact", "--env", "lava-grid", "--eta", "0"], ["--eta", "at least 1, got 0"]),
+    ] {
+        let message = refusal(&arguments);
+        for part in parts {
+            assert!(message.contains(part), "{arguments:?}: {message:?} lacks {part:?}");
+        }
+    }
+    assert!(!Path::new(out).exists(), "a refused command left something behind");
+}
+
+#[test]
+fn wrong_usage_is_refused_with_the_reason() {
+    for (arguments, reason) in [
+        (vec!["bench", "--config", "x", "--jobs", "0"], "use a whole number of at least 1"),
+        (vec!["slurm"], "--config <FILE>"),
+        (
+            vec!["train", "--env", "lava-lake", "--eta", "1", "--seed", "1"],
+            "\"lava-grid\" or \"lava-point\"",
+        ),
+        (vec!["config", "--env", "pit"], "\"lava-grid\" or \"lava-point\""),
+        (
+            vec!["bench", "--config", "x", "--device", "tpu"],
+            "is not \"cpu\", \"cuda\" or \"cuda:N\"",
+        ),
+    ] {
+        let output = program().args(&arguments).output().unwrap();
+        let error = String::from_utf8(output.stderr).unwrap();
+        assert_eq!(output.status.code(), Some(2), "{arguments:?}");
+        assert!(error.contains(reason), "{arguments:?}: {error}");
+    }
+}
+
+#[test]
+fn a_reader_that_stops_listening_is_no_error() {
+    use std::process::Stdio;
+    let program = assert_cmd::cargo::cargo_bin("cvar-game");
+    let mut child = std::process::Command::new(program)
+        .arg("envs")
+        .stdout(Stdio::piped())
+        .stderr(Stdio::piped())
+        .spawn()
+        .unwrap();
+    drop(child.stdout.take());
+    let output = child.wait_with_output().unwrap();
+    assert!(output.status.success() && output.stderr.is_empty(), "{output:?}");
+}
+
+#[test]
+#[cfg(not(feature = "torch"))]
+fn a_build_without_torch_says_how_to_get_a_device() {
+    let folder = tempfile::tempdir().unwrap();
+    let out = folder.path().join("out");
+    let run = ["train", "--env", "lava-grid", "--eta", "1", "--seed", "1", "--device", "cuda"];
+    let arguments = [&run[..], &["--out", out.to_str().unwrap()]].concat();
+    assert!(refusal(&arguments).contains("cargo xtask torch"));
+    assert!(!out.join("lava-grid").exists());
+}
+
+/// Whole runs, small enough for a test.
+mod runs {
+    use super::*;
+    use std::process::{Child, Stdio};
+    use std::time::{Duration, Instant};
+
+    /// Rollouts of 400 steps, and few episodes of evaluation.
+    const SMALL: &str = "
+        [experiment]
+        envs = [\"lava-grid\", \"lava-point\"]
+        etas = [1, 25]
+        seeds = [1]
+        [train]
+        steps = 4_000
+        parallel_episodes = 10
+        protagonist.minibatch = 200
+        antagonist.minibatch = 200
+        [evaluation]
+        episodes = 200
+        figure_episodes = 200
+        parallel_episodes = 100
+        ";
+
+    /// A run that would take hours.
+    const ENDLESS: &str = "train.steps=4_000_000_000";
+
+    #[test]
+    fn train_ends_with_its_summary_and_keeps_a_finished_run() {
+        let folder = tempfile::tempdir().unwrap();
+        let config = config_file(&folder, SMALL);
+        let out = folder.path().join("out");
+        let arguments = [
+            "train",
+            "--env",
+            "lava-grid",
+            "--eta",
+            "25",
+            "--seed",
+            "3",
+            "--config",
+            &config,
+            "--json",
+            "--out",
+            out.to_str().unwrap(),
+        ];
+        let first = answer(&arguments);
+        let json: serde_json::Value =
+            serde_json::from_str(first.lines().next_back().unwrap()).unwrap();
+        assert_eq!((&json["env"], &json["seed"]), (&"lava-grid".into(), &3.into()), "{json}");
+        assert_eq!((&json["eta"], &json["steps"]), (&25.0.into(), &4000.into()), "{json}");
+        for key in ["seconds", "steps_per_second", "greedy_mean", "greedy_cvar"] {
+            assert!(json[key].is_number(), "{key} in {json}");
+        }
+        let run = out.join("lava-grid/game/eta-25/seed-3");
+        assert_eq!(json["folder"], run.to_str().unwrap());
+        for file in [
+            "config.toml",
+            "manifest.json",
+            "progress.csv",
+            "final.safetensors",
+            "figure_data.json",
+            "evaluation.json",
+        ] {
+            assert!(run.join(file).exists(), "{file} is missing");
+        }
+        let written = fs::metadata(run.join("final.safetensors")).unwrap().modified().unwrap();
+        assert_eq!(answer(&arguments), first);
+        let now = fs::metadata(run.join("final.safetensors")).unwrap().modified().unwrap();
+        assert_eq!(now, written, "the finished run was carried out again");
+    }
+
+    #[test]
+    fn bench_prints_and_writes_the_table() {
+        let folder = tempfile::tempdir().unwrap();
+        let config = config_file(&folder, SMALL);
+        let out = folder.path().join("out");
+        let text = answer(&["bench", "--config", &config, "--out", out.to_str().unwrap()]);
+        assert!(text.contains("lava-grid") && text.contains("lava-point"), "{text}");
+        for file in ["runs.csv", "table.csv", "table.md"] {
+            assert!(out.join(file).exists(), "{file} is missing");
+        }
+        assert_eq!(answer(&["table", out.to_str().unwrap()]), text);
+        let run = out.join("lava-grid/game/eta-25/seed-1");
+        for antagonist in ["nominal", "learned", "exact"] {
+            let run = run.to_str().unwrap();
+            let text = answer(&["evaluate", run, "--antagonist", antagonist, "--episodes", "100"]);
+            assert!(text.contains("greedy protagonist"), "{text}");
+        }
+    }
+
+    /// A sweep of endless runs, once its workers are at work.
+    fn endless(folder: &TempDir, out: &Path) -> Child {
+        let config = config_file(folder, SMALL);
+        let child = std::process::Command::new(assert_cmd::cargo::cargo_bin("cvar-game"))
+            .args(["bench", "--jobs", "2", "--config", &config, "--set", ENDLESS, "--out"])
+            .arg(out)
+            .stdout(Stdio::null())
+            .stderr(Stdio::null())
+            .spawn()
+            .unwrap();
+        wait_for("two workers", || workers(out).len() == 2);
+        child
+    }
+
+    /// The processes of the workers in an output folder.
+    fn workers(out: &Path) -> Vec<String> {
+        let out = out.to_str().unwrap();
+        let mut found = Vec::new();
+        for entry in fs::read_dir("/proc").unwrap().flatten() {
+            let command = fs::read_to_string(entry.path().join("cmdline")).unwrap_or_default();
+            if command.contains("\0worker\0") && command.contains(out) {
+                found.push(entry.file_name().into_string().unwrap());
+            }
+        }
+        found
+    }
+
+    fn wait_for(what: &str, condition: impl Fn() -> bool) {
+        let start = Instant::now();
+        while !condition() {
+            assert!(start.elapsed() < Duration::from_secs(60), "waited in vain for {what}");
+            std::thread::sleep(Duration::from_millis(20));
+        }
+    }
+
+    fn signal(child: &Child, signal: &str) {
+        let id = child.id().to_string();
+        assert!(std::process::Command::new("kill").args([signal, &id]).status().unwrap().success());
+    }
+
+    #[test]
+    fn a_signal_stops_the_workers_and_sets_the_exit_code() {
+        for (name, code) in [("-INT", 130), ("-TERM", 75)] {
+            let folder = tempfile::tempdir().unwrap();
+            let out = folder.path().join("out");
+            let mut child = endless(&folder, &out);
+            signal(&child, name);
+            assert_eq!(child.wait().unwrap().code(), Some(code));
+            assert!(workers(&out).is_empty(), "workers outlive the sweep");
+        }
+    }
+
+    #[test]
+    fn workers_do_not_outlive_a_sweep_that_was_killed() {
+        let folder = tempfile::tempdir().unwrap();
+        let out = folder.path().join("out");
+        let mut child = endless(&folder, &out);
+        signal(&child, "-KILL");
+        child.wait().unwrap();
+        wait_for("the workers' end", || workers(&out).is_empty());
+    }
+}
