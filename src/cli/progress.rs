@@ -125,7 +125,10 @@ fn style(template: &str) -> ProgressStyle {
         .progress_chars("=> ")
 }
 
-/// Seconds in words: `7 seconds`, `12 minutes`.
-fn time(seconds: f64) -> HumanDuration {
-    HumanDuration(Duration::try_from_secs_f64(seconds).unwrap_or_default())
+/// Seconds in words: `0.4 s`, `12 seconds`, `5 minutes`.
+fn time(seconds: f64) -> String {
+    if seconds < 10.0 {
+        return format!("{seconds:.1} s"); // whole seconds would say 0
+    }
+    HumanDuration(Duration::try_from_secs_f64(seconds).unwrap_or_default()).to_string()
 }
