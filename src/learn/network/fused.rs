@@ -11,15 +11,29 @@ use pulp::{Arch, Simd, WithSimd};
 /// Samples of a block: a multiple of the width of any vector register.
 const SAMPLES: usize = 32;
 
+/// Numbers that begin at a multiple of 64 bytes: a vector load then stays within one cache line.
+#[derive(Debug, Default)]
+struct Aligned(Vec<f32>);
+
+impl Aligned {
+    /// `length` numbers, whose values are those of the last call or zero.
+    fn slice(&mut self, length: usize) -> &mut [f32] {
+        const LINE: usize = 64;
+        self.0.resize(length + LINE / size_of::<f32>(), 0.0);
+        let start = self.0.as_ptr().align_offset(LINE);
+        &mut self.0[start..start + length]
+    }
+}
+
 /// What the passes keep between calls, so that nothing is allocated in them.
 #[derive(Debug, Default)]
 pub struct Fused {
-    x: Vec<f32>,
-    h: Vec<f32>,
-    y: Vec<f32>,
+    x: Aligned,
+    h: Aligned,
+    y: Aligned,
     /// Gradients of W' and of V, a partial sum per lane.
-    by_first: Vec<f32>,
-    by_second: Vec<f32>,
+    by_first: Aligned,
+    by_second: Aligned,
 }
 
 /// tanh, by the rational approximation of degree 13/6 that Eigen and XLA use; a test checks it to 1e-6.
@@ -138,17 +152,18 @@ impl WithSimd for Evaluate<'_> {
             if critic { (hidden, shape.outputs..shape.rows()) } else { (0, 0..shape.outputs) };
         let samples = inputs.len() / width;
         outputs.resize(rows.len() * samples, 0.0);
-        let (mut x, mut h) = (vec![0.0; width * SAMPLES], vec![0.0; hidden * SAMPLES]);
+        let (mut x, mut h) = (Aligned::default(), Aligned::default());
+        let (x, h) = (x.slice(width * SAMPLES), h.slice(hidden * SAMPLES));
         let mut y = [0.0; SAMPLES];
         for (block, inputs) in inputs.chunks(width * SAMPLES).enumerate() {
-            load(inputs, width, &mut x);
-            hidden_layer(simd, parameters, 2 * hidden, first, &x, &mut h);
+            load(inputs, width, x);
+            hidden_layer(simd, parameters, 2 * hidden, first, x, h);
             let start = block * SAMPLES;
             let end = samples.min(start + SAMPLES);
             for (index, row) in rows.clone().enumerate() {
                 let at = shape.second_at(row, first);
                 let bias = parameters[shape.bias_at() + row];
-                output(simd, &parameters[at..at + hidden], bias, &h, &mut y);
+                output(simd, &parameters[at..at + hidden], bias, h, &mut y);
                 outputs[index * samples + start..index * samples + end]
                     .copy_from_slice(&y[..end - start]);
             }
@@ -187,13 +202,13 @@ impl<L: FnMut(Outputs<'_>)> WithSimd for Differentiate<'_, L> {
         let Differentiate { shape, parameters, inputs, gradient, mut loss, buffers } = self;
         let (width, hidden, units) = (shape.width(), shape.hidden, 2 * shape.hidden);
         let Fused { x, h, y, by_first, by_second } = buffers;
-        x.resize(width * SAMPLES, 0.0);
-        h.resize(units * SAMPLES, 0.0);
-        y.resize(shape.rows() * SAMPLES, 0.0);
-        by_first.clear();
-        by_first.resize(units * width * S::F32_LANES, 0.0);
-        by_second.clear();
-        by_second.resize(shape.rows() * hidden * S::F32_LANES, 0.0);
+        let x = x.slice(width * SAMPLES);
+        let h = h.slice(units * SAMPLES);
+        let y = y.slice(shape.rows() * SAMPLES);
+        let by_first = by_first.slice(units * width * S::F32_LANES);
+        let by_second = by_second.slice(shape.rows() * hidden * S::F32_LANES);
+        by_first.fill(0.0);
+        by_second.fill(0.0);
         gradient.fill(0.0);
         for (block, inputs) in inputs.chunks(width * SAMPLES).enumerate() {
             let samples = inputs.len() / width;
