@@ -1,7 +1,7 @@
 //! Reading and writing of whole files: none is left half written, none from elsewhere is read without
-//! a limit.
+//! a limit, and nothing waits for a pipe in the place of a file.
 
-use std::fs::File;
+use std::fs::{self, File, OpenOptions};
 use std::io::{self, Read, Write};
 use std::path::Path;
 
@@ -30,13 +30,44 @@ pub fn write_in_place(path: &Path, bytes: &[u8]) -> io::Result<()> {
 /// # Errors
 /// If the folder cannot be read or written.
 pub fn remove_parts(folder: &Path) -> io::Result<()> {
-    for entry in std::fs::read_dir(folder)? {
+    for entry in fs::read_dir(folder)? {
         let entry = entry?;
         if entry.file_name().as_encoded_bytes().starts_with(PART.as_bytes()) {
-            std::fs::remove_file(entry.path())?;
+            fs::remove_file(entry.path())?;
         }
     }
     Ok(())
+}
+
+/// Opens a regular file, or makes one where `options` say so. A pipe or a device in its place is refused:
+/// opening or reading it could wait forever.
+///
+/// # Errors
+/// If it is something else than a file, or cannot be opened.
+pub fn open_file(path: &Path, options: &mut OpenOptions) -> io::Result<File> {
+    if fs::metadata(path).is_ok_and(|found| !found.is_file() && !found.is_dir()) {
+        let problem = "it is a pipe or a device; put a regular file in its place";
+        return Err(io::Error::new(io::ErrorKind::InvalidInput, problem));
+    }
+    #[cfg(unix)] // it may become a pipe before it is opened
+    std::os::unix::fs::OpenOptionsExt::custom_flags(options, libc::O_NONBLOCK);
+    options.open(path)
+}
+
+/// Opens a regular file for reading, as [`open_file`].
+///
+/// # Errors
+/// As [`open_file`].
+pub fn open(path: &Path) -> io::Result<File> {
+    open_file(path, OpenOptions::new().read(true))
+}
+
+/// Makes a regular file, or empties the one that is there, as [`open_file`].
+///
+/// # Errors
+/// As [`open_file`].
+pub fn create(path: &Path) -> io::Result<File> {
+    open_file(path, OpenOptions::new().write(true).create(true).truncate(true))
 }
 
 /// More bytes than any configuration, evaluation or file of weights has.
@@ -48,7 +79,7 @@ pub const LARGEST_FILE: u64 = 64 << 20;
 /// If it cannot be read or is longer than `limit`.
 pub fn read_at_most(path: &Path, limit: u64) -> io::Result<Vec<u8>> {
     let mut bytes = Vec::new();
-    File::open(path)?.take(limit + 1).read_to_end(&mut bytes)?;
+    open(path)?.take(limit + 1).read_to_end(&mut bytes)?;
     if bytes.len() as u64 > limit {
         let problem = format!("it is larger than {limit} bytes");
         return Err(io::Error::new(io::ErrorKind::FileTooLarge, problem));

@@ -5,8 +5,11 @@ use std::fs;
 use std::path::Path;
 use tempfile::TempDir;
 
+/// The program; the variable CVAR_GAME_TESTED names another build of it, to see a test fail on a former
+/// version.
 fn program() -> Command {
-    Command::cargo_bin("cvar-game").unwrap()
+    let tested = std::env::var_os("CVAR_GAME_TESTED");
+    tested.map_or_else(|| Command::cargo_bin("cvar-game").unwrap(), Command::new)
 }
 
 /// Standard output of a command that succeeds.
@@ -137,6 +140,93 @@ fn wrong_usage_is_refused_with_the_reason() {
 }
 
 #[test]
+fn numbers_may_be_grouped_and_negative_ones_are_refused_with_their_range() {
+    let folder = tempfile::tempdir().unwrap();
+    let out = folder.path().to_str().unwrap();
+    let train = ["train", "--env", "lava-grid", "--eta", "1", "--seed", "1", "--out", out];
+    for (rest, reason) in [
+        (vec!["--steps", "1_000"], "train.steps = 1000 is less than one rollout"),
+        (vec!["--set", "train.steps=1_000"], "train.steps = 1000 is less than one rollout"),
+        (vec!["--steps", "-5"], "train.steps = -5 (from --steps)"),
+    ] {
+        let message = refusal(&[&train[..], &rest].concat());
+        assert!(message.contains(reason), "{rest:?}: {message}");
+    }
+    for (arguments, reason) in [
+        (vec!["evaluate", out, "--episodes", "1_000"], "holds no run"),
+        (vec!["rollout", out, "--episodes", "1_000_000"], "holds no run"),
+        (vec!["rollout", out, "--seed", "1_0"], "holds no run"),
+        (vec!["evaluate", out, "--episodes", "-5"], "not negative"),
+        (vec!["evaluate", out, "--episodes", "0"], "at least 1"),
+        (vec!["evaluate", out, "--episodes", "1__0"], "such as 100_000"),
+        (vec!["evaluate", out, "--episodes", "many"], "such as 100_000"),
+        (vec!["evaluate", out, "--seed", "-1"], "not negative"),
+        (vec!["rollout", out, "--episodes", "-5"], "not negative"),
+        (vec!["rollout", out, "--seed", "99999999999999999999999"], "too large"),
+        (vec!["bench", "--jobs", "-2"], "at least 1"),
+        (vec!["slurm", "--config", "x", "--out", out, "--array-limit", "-2"], "at least 1"),
+        (vec!["exact", "--env", "lava-point", "--eta", "25", "--cell", "-1"], "-1"),
+        (vec!["exact", "--env", "lava-point", "--eta", "25", "--velocity", "-1"], "-1"),
+    ] {
+        let output = program().args(&arguments).output().unwrap();
+        let error = String::from_utf8(output.stderr).unwrap();
+        assert_eq!(output.status.code(), Some(2), "{arguments:?}: {error}");
+        assert!(error.contains(reason), "{arguments:?}: {error}");
+        assert!(!error.contains("unexpected argument"), "{arguments:?}: {error}");
+    }
+}
+
+#[test]
+fn a_world_whose_goal_is_out_of_reach_is_refused() {
+    for (set, parts) in [
+        ("env.lava-grid.map=SL\nLG", ["row 1, column 1", "no way past lava and walls"]),
+        ("env.lava-grid.map=S#G", ["env.lava-grid.map", "no way past lava and walls"]),
+        (
+            "env.lava-grid.horizon=12",
+            ["horizon = 12", "at least 13, the moves of the shortest way"],
+        ),
+        ("env.lava-point.lava.max=[10, 2]", ["env.lava-point.goal", "does not touch the lava"]),
+        ("env.lava-point.lava.max=[8, 6.9]", ["env.lava-point.goal", "does not touch the lava"]),
+        ("env.lava-point.start=[3, 1]", ["env.lava-point.start", "neither the lava"]),
+    ] {
+        let message = refusal(&["config", "--set", &set.replace("\\n", "\n")]);
+        for part in parts {
+            assert!(message.contains(part), "{set}: {message}");
+        }
+    }
+    // As long as the shortest way, and a gap that is wider than the disc.
+    answer(&["config", "--set", "env.lava-grid.horizon=13"]);
+    answer(&["config", "--set", "env.lava-point.lava.max=[8, 6.7]"]);
+}
+
+#[test]
+fn completions_and_manual_pages_know_the_verbs_and_their_options() {
+    for shell in ["bash", "zsh", "fish", "elvish", "powershell"] {
+        let script = answer(&["completions", shell]);
+        assert!(script.contains("rollout") && script.contains("antagonist"), "{shell}");
+    }
+    let folder = tempfile::tempdir().unwrap();
+    let pages = folder.path().join("man1");
+    answer(&["man", "--out", pages.to_str().unwrap()]);
+    let page = |name: &str| fs::read_to_string(pages.join(name)).unwrap();
+    assert!(page("cvar-game.1").contains("bench"));
+    assert!(page("cvar-game-rollout.1").contains("antagonist"));
+    assert!(!pages.join("cvar-game-worker.1").exists(), "the workers' verb is not for users");
+}
+
+#[test]
+fn the_hint_of_slurm_is_a_command_of_the_shell() {
+    let folder = tempfile::tempdir().unwrap();
+    let config =
+        config_file(&folder, "[experiment]\nenvs = [\"lava-grid\"]\netas = [1]\nseeds = [1]\n");
+    let out = folder.path().join("it's here");
+    let hint = answer(&["slurm", "--config", &config, "--out", out.to_str().unwrap()]);
+    assert!(hint.starts_with("1 run to do"), "{hint}");
+    let words = shlex::split(hint.split_once(": ").unwrap().1).unwrap();
+    assert_eq!(words, ["sh", out.join("slurm/submit.sh").to_str().unwrap()]);
+}
+
+#[test]
 fn a_reader_that_stops_listening_is_no_error() {
     use std::process::Stdio;
     let program = assert_cmd::cargo::cargo_bin("cvar-game");
@@ -182,6 +272,22 @@ mod runs {
         [evaluation]
         episodes = 200
         figure_episodes = 200
+        parallel_episodes = 100
+        ";
+
+    /// The same at budget 1, with keys that all versions have.
+    const PLAIN: &str = "
+        [experiment]
+        envs = [\"lava-grid\", \"lava-point\"]
+        etas = [1]
+        seeds = [1, 2]
+        [train]
+        steps = 4_000
+        parallel_episodes = 10
+        protagonist.minibatch = 200
+        antagonist.minibatch = 200
+        [evaluation]
+        episodes = 3_000
         parallel_episodes = 100
         ";
 
@@ -231,6 +337,81 @@ mod runs {
         assert_eq!(answer(&arguments), first);
         let now = fs::metadata(run.join("final.safetensors")).unwrap().modified().unwrap();
         assert_eq!(now, written, "the finished run was carried out again");
+    }
+
+    /// On a terminal, which `script` provides.
+    #[test]
+    fn a_bar_says_what_is_done_and_how_long_it_will_take() {
+        let folder = tempfile::tempdir().unwrap();
+        let config = config_file(&folder, PLAIN);
+        let out = folder.path().join("out");
+        let (program, out) = (program().get_program().to_owned(), out.to_str().unwrap().to_owned());
+        let line = format!("{} bench --config {config} --out {out}", program.to_str().unwrap());
+        let mut script = std::process::Command::new("script");
+        script.args(["-qefc", &line, "/dev/null"]).stdin(Stdio::null());
+        let shown = script.env("TERM", "xterm").output().unwrap();
+        assert!(shown.status.success(), "{shown:?}");
+        let shown = String::from_utf8_lossy(&shown.stdout).into_owned();
+        for part in ["evaluating, ", " left", "of 4 ended", "steps/s"] {
+            assert!(shown.contains(part), "{part} is missing in {shown}");
+        }
+        assert_eq!(shown.matches("finished in").count(), 4, "{shown}");
+    }
+
+    #[test]
+    fn progress_has_the_lengths_of_episodes_and_a_rollout_the_states_after_its_steps() {
+        let folder = tempfile::tempdir().unwrap();
+        let config = config_file(&folder, PLAIN);
+        let out = folder.path().join("out");
+        let out = out.to_str().unwrap();
+        answer(&[
+            "train",
+            "--env",
+            "lava-point",
+            "--eta",
+            "1",
+            "--seed",
+            "1",
+            "--config",
+            &config,
+            "--out",
+            out,
+        ]);
+        let found =
+            std::process::Command::new("find").args([out, "-name", "progress.csv"]).output();
+        let progress =
+            std::path::PathBuf::from(String::from_utf8(found.unwrap().stdout).unwrap().trim());
+        let column = |text: &str, name: &str| -> Vec<String> {
+            let mut reader = csv::Reader::from_reader(text.as_bytes());
+            let head = reader.headers().unwrap().clone();
+            let at = head.iter().position(|of| of == name);
+            let at = at.unwrap_or_else(|| panic!("there is no column {name} in {head:?}"));
+            reader.records().map(|row| row.unwrap()[at].to_owned()).collect()
+        };
+        let text = fs::read_to_string(&progress).unwrap();
+        for length in column(&text, "mean_length") {
+            let length: f64 = length.parse().unwrap();
+            assert!(length.is_nan() || (1.0..=40.0).contains(&length), "{length}");
+        }
+        let events = fs::read(progress.with_file_name("events.out.tfevents.cvar-game")).unwrap();
+        let tag = b"charts/episodic_length";
+        assert!(events.windows(tag.len()).any(|bytes| bytes == tag), "TensorBoard has no lengths");
+        let run = progress.parent().unwrap().to_str().unwrap();
+        let rows = answer(&["rollout", "--run", run, "--episodes", "20"]);
+        let (ends, times) = (column(&rows, "end"), column(&rows, "t"));
+        for name in ["x", "y", "vx", "vy"] {
+            let (before, after) = (column(&rows, name), column(&rows, &format!("next_{name}")));
+            for row in 1..before.len() {
+                let continues = times[row] != "0";
+                assert_eq!(continues, ends[row - 1].is_empty());
+                assert!(!continues || before[row] == after[row - 1], "{name} in row {row}");
+            }
+        }
+        // The last state is the one after the last step.
+        let last = ends.iter().position(|end| end == "lava").expect("an episode ends in lava");
+        let place = |name: &str| column(&rows, name)[last].parse::<f64>().unwrap();
+        let [x, y] = ["next_x", "next_y"].map(place);
+        assert!((1.8..=8.2).contains(&x) && (-0.2..=2.2).contains(&y), "({x}, {y})");
     }
 
     #[test]

@@ -83,8 +83,8 @@ fn every_key_of_the_default_has_its_comment() {
 fn a_later_layer_wins_and_a_worlds_own_section_within_one() {
     let steps = |config: &Config| WORLDS.map(|world| config.world(world).train.steps);
     let cases: [(Option<&str>, &[&str], [u64; 2]); 8] = [
-        (Some("train.steps = 20_000"), &[], [20_000, 20_000]),
-        (Some("train.steps = 20_000\nenv.lava-point.train.steps = 30_000"), &[], [20_000, 30_000]),
+        (Some("train.steps = 80_000"), &[], [80_000, 80_000]),
+        (Some("train.steps = 80_000\nenv.lava-point.train.steps = 30_000"), &[], [80_000, 30_000]),
         // --set is later than the file, so it wins over the file's section of the world too.
         (Some("env.lava-point.train.steps = 30_000"), &["train.steps=40_000"], [40_000, 40_000]),
         (None, &["env.lava-grid.train.steps=50_000"], [50_000, 5_000_000]),
@@ -179,8 +179,8 @@ fn bad_values_are_refused_with_key_value_and_range() {
         ("evaluation.alphas=[0]", ["evaluation.alphas = [0]", "above 0 and at most 1"]),
         ("env.lava-grid.slip=2", ["env.lava-grid.slip = 2", "at least 0 and at most 1"]),
         ("env.lava-grid.slip=nan", ["env.lava-grid.slip = nan", "a finite number"]),
-        ("env.lava-grid.horizon=0", ["env.lava-grid.horizon = 0", "from 1 to 4294967295"]),
-        ("env.lava-grid.horizon=-1", ["env.lava-grid.horizon = -1", "from 1 to 4294967295"]),
+        ("env.lava-grid.horizon=0", ["env.lava-grid.horizon = 0", "from 1 to 1000000"]),
+        ("env.lava-grid.horizon=-1", ["env.lava-grid.horizon = -1", "from 1 to 1000000"]),
         ("env.lava-grid.map=..G", ["env.lava-grid.map", "no start"]),
         ("env.lava-grid.map=S..", ["env.lava-grid.map", "no goal"]),
         ("env.lava-point.arena=[1]", ["env.lava-point.arena = [1]", "a list of 2 numbers"]),
@@ -197,6 +197,34 @@ fn bad_values_are_refused_with_key_value_and_range() {
     }
     let message = refusal(None, &["train.budget_wait=0.6", "train.budget_rise=0.6"]);
     assert!(message.contains("must be at most 1"), "{message}");
+}
+
+/// Whether Algorithm 1 updates the protagonist at all, by its schedule.
+#[test]
+fn a_run_that_never_updates_the_protagonist_is_refused_with_the_steps_that_would() {
+    const GRID: &str = "experiment.envs=[\"lava-grid\"]";
+    for (sets, reason) in [
+        (&["train.steps=20_000"][..], "eta = 25"),
+        (&["train.steps=80_000", "train.follower_updates=8"], "at least 90000"),
+        (&["train.steps=20_000", "train.response=0.5"], "at least 50000"),
+        (&["train.response=1"], "train.response = 1; lower it"),
+        (&["train.steps=20_000", "experiment.etas=[1, 2]"], "eta = 2"),
+    ] {
+        let message = refusal(None, &[&[GRID], sets].concat());
+        assert!(message.contains("never updated") && message.contains(reason), "{message}");
+    }
+    for sets in [
+        &["train.steps=30_000"][..],
+        &["train.steps=90_000", "train.follower_updates=8"],
+        &["train.steps=50_000", "train.response=0.5"],
+        &["train.steps=10_000", "experiment.etas=[1]"],
+        &["train.steps=10_000", "train.leader=antagonist"],
+        &["train.steps=10_000", "train.adversary=random"],
+        &["train.steps=10_000", "train.budget_wait=0.1"],
+        &["train.steps=10_000", "experiment.methods=[\"uniform\"]"],
+    ] {
+        resolve(None, &[&[GRID], sets].concat()).unwrap();
+    }
 }
 
 #[test]
@@ -286,13 +314,13 @@ fn a_runs_configuration_is_checked_when_it_is_read() {
 fn differences_of_runs_are_listed_by_key() {
     let id: RunId = "lava-grid/game/eta-25/seed-3".parse().unwrap();
     let here = resolve(None, &[]).unwrap().run(&id);
-    let there = resolve(None, &["train.steps=10_000", "env.slip=0.1"]).unwrap().run(&id);
+    let there = resolve(None, &["train.steps=30_000", "env.slip=0.1"]).unwrap().run(&id);
     let listed: Vec<String> = here
         .differences(&there)
         .iter()
         .map(|difference| format!("{} {} {}", difference.key, difference.ours, difference.theirs))
         .collect();
-    assert_eq!(listed, ["env.lava-grid.slip 0.05 0.1", "train.steps 5000000 10000"]);
+    assert_eq!(listed, ["env.lava-grid.slip 0.05 0.1", "train.steps 5000000 30000"]);
     assert!(here.differences(&here).is_empty());
 }
 
@@ -541,7 +569,7 @@ name = \"plain\"
 [[experiment.variant]]
 name = \"short\"
 etas = [25]
-set = { \"train.steps\" = 20_000, env.substeps = 2 }
+set = { \"train.steps\" = 80_000, env.substeps = 2 }
 ";
 
 fn names(config: &Config) -> Vec<String> {
@@ -564,11 +592,11 @@ fn variants_and_axes_are_combined() {
     );
     let run = config.run(&"lava-point/game/short+noise-0.5/eta-25/seed-1".parse().unwrap());
     let point = run.env.of::<LavaPoint>().unwrap();
-    assert_eq!((run.train.steps, point.substeps, point.noise, point.mass), (20_000, 2, 0.5, 2.0));
+    assert_eq!((run.train.steps, point.substeps, point.noise, point.mass), (80_000, 2, 0.5, 2.0));
     assert_eq!(run.variant, Some("short+noise-0.5".parse::<VariantName>().unwrap()));
     // The command line wins over a variant.
-    let config = resolve(Some(VARIANTS), &["train.steps=10_000"]).unwrap();
-    assert!(plan::runs(&config).iter().all(|id| config.run(id).train.steps == 10_000));
+    let config = resolve(Some(VARIANTS), &["train.steps=30_000"]).unwrap();
+    assert!(plan::runs(&config).iter().all(|id| config.run(id).train.steps == 30_000));
     // What the command line chooses narrows a variant's own choice.
     let config = resolve(Some(VARIANTS), &["experiment.etas=[1, 5]"]).unwrap();
     assert_eq!(plan::runs(&config).len(), 4, "{:?}", names(&config));
@@ -655,7 +683,7 @@ fn wrong_variants_are_refused_by_name() {
             ["unknown key train.stops", "variant stops-1"],
         ),
         (
-            "experiment.axes.train.steps = [20_000, 0]".to_owned(),
+            "experiment.axes.train.steps = [40_000, 0]".to_owned(),
             ["train.steps = 0", "variant steps-0"],
         ),
         (
@@ -687,12 +715,12 @@ fn a_file_may_extend_another() {
         path
     };
     let load = |path: &Path| Config::resolve(standard().catalogue(), Source::File(path), &[]);
-    write("base.toml", "train.steps = 20_000\nenv.lava-point.train.steps = 30_000\n");
+    write("base.toml", "train.steps = 80_000\nenv.lava-point.train.steps = 30_000\n");
     let over = write("sub/over.toml", "extends = \"../base.toml\"\n[train]\nsteps = 40_000\n");
     let last = write("last.toml", "extends = \"sub/over.toml\"\nenv.lava-grid.slip = 0.2\n");
     // A later file wins, also over a world's own section of an earlier one.
     let steps = |config: &Config| WORLDS.map(|world| config.world(world).train.steps);
-    assert_eq!(steps(&load(&folder.path().join("base.toml")).unwrap()), [20_000, 30_000]);
+    assert_eq!(steps(&load(&folder.path().join("base.toml")).unwrap()), [80_000, 30_000]);
     assert_eq!(steps(&load(&over).unwrap()), [40_000, 40_000]);
     let config = load(&last).unwrap();
     assert_eq!(steps(&config), [40_000, 40_000]);

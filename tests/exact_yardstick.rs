@@ -135,7 +135,7 @@ fn the_frontier_is_that_of_the_optima() {
 
 #[test]
 fn answers_are_pages_and_json() {
-    let answer = yardstick().answer(ETA).unwrap().unwrap();
+    let answer = yardstick().answer(ETA, &()).unwrap().unwrap();
     let summary = grid().solve(ETA).unwrap();
     assert_eq!(answer.to_string(), summary.to_string());
     assert_eq!(answer.json(), serde_json::to_string(&summary).unwrap());
@@ -147,8 +147,8 @@ fn lava_point_is_measured_by_its_oracle() {
     let options = Options { source: Source::Shipped, ..Options::default() };
     let yardstick = LavaPoint::yardstick(&constants, 1.0, &options).unwrap().unwrap();
     assert!(yardstick.exact().is_none());
-    let certified = oracle::shipped(&constants, 1.0, ETA, &Effort::default()).unwrap();
-    assert_eq!(yardstick.answer(ETA).unwrap().unwrap().to_string(), certified.to_string());
+    let certified = oracle::shipped(&constants, 1.0, ETA, &Effort::of(&constants)).unwrap();
+    assert_eq!(yardstick.answer(ETA, &()).unwrap().unwrap().to_string(), certified.to_string());
     let law = yardstick.optimal_law(ETA).unwrap().unwrap();
     assert_eq!(law, certified.law);
     // The oracle's own episodes as those of a policy.
@@ -161,7 +161,7 @@ fn lava_point_is_measured_by_its_oracle() {
     assert_eq!(found.antagonist_gap, law.mean() - law.cvar(1.0 / ETA));
     assert_eq!(found.antagonist_gap_standard_error, law.mean_standard_error().hypot(error));
     // No certificate comes with the program for other budgets.
-    assert!(yardstick.answer(3.0).unwrap().is_none());
+    assert!(yardstick.answer(3.0, &()).unwrap().is_none());
     assert!(yardstick.compare(3.0, &evidence).unwrap().is_none());
 }
 

@@ -5,7 +5,7 @@
 mod fuzz;
 
 use cap::Cap;
-use cvar_game::experiment::archive;
+use cvar_game::experiment::archive::{self, RunName};
 use cvar_game::experiment::artefacts::{Evaluation, SCHEMA};
 use cvar_game::experiment::config::{Config, RunConfig, Setting, Source};
 use cvar_game::experiment::figure_data::FigureData;
@@ -13,8 +13,9 @@ use cvar_game::experiment::names::RunId;
 use cvar_game::experiment::registry::standard;
 use cvar_game::experiment::{plan, runner};
 use cvar_game::report::runs::Runs;
+use cvar_game::report::settings::Settings;
 use cvar_game::report::table::{Results, Table};
-use cvar_game::report::{self, figures, page};
+use cvar_game::report::{self, Optimum, Worlds, figures, page};
 use fuzz::{fuzz, inputs};
 use lava_envs::map::{MAX_CELLS, Map};
 use std::alloc::System;
@@ -25,6 +26,9 @@ use std::time::Duration;
 /// Whoever asks for more memory than all parsers together need ends the test.
 #[global_allocator]
 static ALLOCATOR: Cap<System> = Cap::new(System, 1 << 30);
+
+/// Columns of text of the terminal.
+const WIDTH: usize = 100;
 
 fuzz::fuzz_targets!(
     configs,
@@ -180,8 +184,8 @@ fn evaluations(effort: (u32, Duration)) -> u64 {
         fs::create_dir_all(&folder).unwrap();
         fs::write(folder.join("evaluation.json"), bytes).unwrap();
         let _ = runner::read_evaluation(&folder);
-        if report::write(out.path()).is_ok() {
-            report::table_json(out.path(), &[]).unwrap();
+        if report::write(out.path(), standard(), WIDTH).is_ok() {
+            report::table_json(out.path(), &[], standard()).unwrap();
         }
     })
 }
@@ -200,8 +204,8 @@ fn episodes(effort: (u32, Duration)) -> u64 {
         let folder = out.join("lava-grid/eta-25/seed-1");
         fs::create_dir_all(&folder).unwrap();
         fs::write(folder.join("episodes.csv"), bytes).unwrap();
-        if report::write(&out).is_ok() {
-            report::table_json(&out, &[]).unwrap();
+        if report::write(&out, standard(), WIDTH).is_ok() {
+            report::table_json(&out, &[], standard()).unwrap();
         }
         assert_eq!(fs::read_dir(&parent).unwrap().count(), 1, "it has left its folder");
     })
@@ -225,8 +229,8 @@ fn archives(effort: (u32, Duration)) -> u64 {
         fs::create_dir(&out).unwrap();
         fs::write(out.join("runs.zip"), bytes).unwrap();
         let _ = runner::read_evaluation(&out.join("lava-grid/eta-25/seed-1"));
-        if report::write(&out).is_ok() {
-            report::table_json(&out, &[]).unwrap();
+        if report::write(&out, standard(), WIDTH).is_ok() {
+            report::table_json(&out, &[], standard()).unwrap();
         }
         assert_eq!(fs::read_dir(&parent).unwrap().count(), 1, "it has left its folder");
     })
@@ -284,11 +288,11 @@ fn drawn(corpus: &str, file: &str, valid: Vec<Vec<u8>>, effort: (u32, Duration))
         fs::write(folder.join("progress.csv"), PROGRESS).unwrap();
         folder
     });
-    let runs = Runs::read(out.path()).unwrap();
+    let runs = Runs::read(out.path(), standard()).unwrap();
     let results = Results::of(&[("results", &runs)]);
     let table = Table::new(&results);
     let draw = || {
-        let (panels, notes) = figures::panels(&results);
+        let (panels, notes) = figures::panels(&results, standard());
         let figures = figures::draw(&panels, notes, standard());
         (panels, figures)
     };
@@ -320,13 +324,24 @@ fn figure_data(effort: (u32, Duration)) -> u64 {
     drawn("figure_data", "figure_data.json", valid.into(), effort)
 }
 
-/// The constants of a world as figures read them from the `config.toml` of a run.
+/// The constants of a world as tables and figures read them from the `config.toml` of a run.
 fn constants(effort: (u32, Duration)) -> u64 {
     let valid = vec![
         b"gamma = 1\n[env.lava-grid]\nmap = \"SG\\n.L\"\nslip = 0.1\nhorizon = 4\n".into(),
         b"gamma = 0.9\n[env.lava-point]\narena = [8.0, 6.0]\n".into(),
     ];
-    drawn("constants", "config.toml", valid, effort)
+    let name = RunName::parse("lava-grid/eta-25/seed-1").unwrap();
+    fuzz(&inputs(valid, "constants"), effort, |bytes| {
+        let text = String::from_utf8_lossy(bytes).into_owned();
+        let Ok(Settings { task, .. }) = Settings::of(&name, Some(text), standard()) else { return };
+        let world = name.world.as_str();
+        standard().limits(world, &task.constants, task.gamma);
+        let optimum = standard().optimum(world, &task.constants, task.gamma, name.eta);
+        if let (Some(_), Optimum::Known(law)) = (standard().scene(world, &task.constants), optimum)
+        {
+            law.cvar(1.0 / name.eta);
+        }
+    })
 }
 
 #[test]
@@ -350,17 +365,20 @@ fn sizes_beyond_reason_are_refused() {
     with_file("deep.toml", format!("{} = 1", "a.".repeat(100_000) + "a").as_bytes(), |path| {
         assert!(Config::resolve(standard().catalogue(), Source::File(path), &[]).is_err());
     });
-    let endless =
-        Config::resolve(standard().catalogue(), Source::File(Path::new("/dev/zero")), &[])
-            .unwrap_err()
-            .to_string();
-    assert!(endless.contains("larger than"), "{endless}");
+    let refusal = |path: &Path| {
+        Config::resolve(standard().catalogue(), Source::File(path), &[]).unwrap_err().to_string()
+    };
+    assert!(refusal(Path::new("/dev/zero")).contains("a device"));
+    with_file("endless.toml", b"", |path| {
+        fs::File::options().write(true).open(path).unwrap().set_len(1 << 40).unwrap();
+        assert!(refusal(path).contains("larger than"));
+    });
     let square = "<svg xmlns=\"http://www.w3.org/2000/svg\" width=\"50000\" height=\"50000\"/>";
     figures::png(square).unwrap();
     let out = tempfile::tempdir().unwrap();
     let folder = out.path().join("lava-grid/eta-25/seed-1");
     fs::create_dir_all(&folder).unwrap();
     std::os::unix::fs::symlink("/dev/zero", folder.join("episodes.csv")).unwrap();
-    let endless = report::write(out.path()).unwrap_err().to_string();
-    assert!(endless.contains("larger than"), "{endless}");
+    let endless = report::write(out.path(), standard(), WIDTH).unwrap_err().to_string();
+    assert!(endless.contains("a device"), "{endless}");
 }

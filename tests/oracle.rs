@@ -4,8 +4,9 @@ use approx::assert_abs_diff_eq;
 use cvar_game::exact::oracle::controller::{Controller, Protagonist, Scripted};
 use cvar_game::exact::oracle::lattice::{Scene, Space, cubic};
 use cvar_game::exact::oracle::play::play;
-use cvar_game::exact::oracle::sweep::{Rewards, Utility, smooth, sweep};
-use cvar_game::exact::oracle::{Effort, Lattice, certify_cached, certify_with, shipped};
+use cvar_game::exact::oracle::sweep::{Rewards, SWEPT, Utility, smooth, sweep};
+use cvar_game::exact::oracle::{Certified, Effort, Lattice, certify, certify_cached, shipped};
+use cvar_game::exact::watch::Watch;
 use lava_envs::law::{GaussianLaw, Law};
 use lava_envs::point::Force;
 use lava_envs::random::{Purpose, stream};
@@ -116,7 +117,7 @@ fn the_move_is_that_of_the_physical_world() {
                 continue;
             }
             let xi = GaussianLaw.sample(&mut random) * 5.0;
-            let found = scene.step(&config, position, [xi.x, xi.y]);
+            let found = scene.step(position, [xi.x, xi.y]);
             let step = real_step(&mut world, position, [xi.x, xi.y]);
             let truth = step.end.filter(|&end| end != End::Timeout);
             if found.end != truth {
@@ -124,7 +125,7 @@ fn the_move_is_that_of_the_physical_world() {
                 let grazing = [1e-3, -1e-3].iter().any(|&shift| {
                     [[shift, 0.0], [0.0, shift]].iter().any(|[dx, dy]| {
                         let near = [position[0] + dx, position[1] + dy];
-                        scene.step(&config, near, [xi.x, xi.y]).end != found.end
+                        scene.step(near, [xi.x, xi.y]).end != found.end
                     })
                 });
                 assert!(grazing, "{position:?}, {xi:?}: {found:?}, but {truth:?}");
@@ -156,7 +157,7 @@ fn landings_are_the_move_of_each_axis() {
     for node in (0..space.nodes()).filter(|&node| space.stopped[node].is_none()) {
         for index in 0..count {
             let velocity = [space.plus(index), space.plus(count - 1 - index)];
-            let moved = scene.step(&config, space.position(node), velocity);
+            let moved = scene.step(space.position(node), velocity);
             if moved.end.is_some() {
                 continue;
             }
@@ -180,10 +181,10 @@ fn the_programme_finds_the_value_of_one_step() {
     let config = PointConfig { horizon: 1, start: [8.6, 0.5], ..PointConfig::default() };
     let space = Space::new(&config, &Lattice { cell: 0.1, velocity: 0.25 }, 2);
     let rewards = Rewards::new(&config, 1.0);
-    let value = sweep(&space, &rewards, Utility::Return, 2, false).value;
-    let controller = Controller::new(space, &rewards, Utility::Return, 2);
+    let value = sweep(&space, &rewards, Utility::Return, SWEPT, 2, false, &()).value;
+    let controller = Controller::new(space, &rewards, Utility::Return, 2, &());
     assert_abs_diff_eq!(controller.value(), value, epsilon = 1e-12);
-    let law = play(&config, 1.0, &controller, 40_000, 3, 2).expect("the world is valid").law;
+    let law = play(&config, 1.0, &controller, 40_000, 3, 2, &()).expect("the world is valid").law;
     let slack = 4.0 * law.mean_standard_error() + 0.01;
     assert_abs_diff_eq!(law.mean(), value, epsilon = slack);
 }
@@ -194,9 +195,9 @@ fn a_coarse_controller_beats_the_scripts() {
     let rewards = Rewards::new(&config, 1.0);
     let space = Space::new(&config, &COARSE, 2);
     let mean = |protagonist: &dyn Protagonist| {
-        play(&config, 1.0, protagonist, 2_000, 5, 2).expect("the world is valid").law.mean()
+        play(&config, 1.0, protagonist, 2_000, 5, 2, &()).expect("the world is valid").law.mean()
     };
-    let best = mean(&Controller::new(space, &rewards, Utility::Return, 2));
+    let best = mean(&Controller::new(space, &rewards, Utility::Return, 2, &()));
     for scripted in Scripted::all(&config) {
         let mean = mean(&scripted);
         assert!(best > mean + 0.05, "{} has {mean}, the controller {best}", scripted.name());
@@ -207,8 +208,8 @@ fn a_coarse_controller_beats_the_scripts() {
 #[test]
 fn nothing_depends_on_the_number_of_threads() {
     let config = short();
-    let one = certify_with(&config, 0.99, 4.0, &Effort { threads: 1, ..small_effort() });
-    let three = certify_with(&config, 0.99, 4.0, &Effort { threads: 3, ..small_effort() });
+    let one = certify(&config, 0.99, 4.0, &Effort { threads: 1, ..small_effort() }, &());
+    let three = certify(&config, 0.99, 4.0, &Effort { threads: 3, ..small_effort() }, &());
     let (one, mut three) = (one.expect("valid"), three.expect("valid"));
     three.seconds = one.seconds;
     assert_eq!(one, three);
@@ -219,7 +220,7 @@ fn certificates_are_kept_under_all_constants() {
     let folder = tempfile::tempdir().expect("a temporary folder");
     let effort = small_effort();
     let ask = |config: &PointConfig, eta: f64, effort: &Effort| {
-        certify_cached(config, 1.0, eta, effort, folder.path()).expect("valid")
+        certify_cached(config, 1.0, eta, effort, folder.path(), &()).expect("valid")
     };
     let count = || std::fs::read_dir(folder.path()).expect("the folder is there").count();
     let first = ask(&short(), 4.0, &effort);
@@ -241,7 +242,8 @@ fn certificates_are_kept_under_all_constants() {
 /// has to compute the certificates again.
 #[test]
 fn the_default_world_has_shipped_certificates() {
-    let (config, effort) = (PointConfig::default(), Effort::default());
+    let config = PointConfig::default();
+    let effort = Effort::of(&config);
     let etas = [
         (1.0, 0.35),
         (2.0, 0.28),
@@ -264,11 +266,97 @@ fn the_default_world_has_shipped_certificates() {
     assert_eq!(shipped(&PointConfig { noise: 1.4, ..config }, 1.0, 25.0, &effort), None);
 }
 
+/// Of a world at a budget, with few episodes.
+fn quick(config: &PointConfig, eta: f64) -> Certified {
+    let effort = Effort {
+        episodes: 20_000,
+        selection_episodes: 10_000,
+        baseline_episodes: 5_000,
+        ..Effort::of(config)
+    };
+    let lattice = Lattice { cell: 0.3, ..effort.lattice };
+    certify(config, 1.0, eta, &Effort { lattice, ..effort }, &()).expect("valid")
+}
+
+#[test]
+fn the_lattice_fits_the_noise() {
+    for noise in [0.05, 0.5] {
+        let config = PointConfig { noise, ..PointConfig::default() };
+        let certified = quick(&config, 25.0);
+        let best = certified.baselines.iter().map(|of| of.cvar).fold(f64::MIN, f64::max);
+        assert!(certified.certified_cvar >= best, "noise {noise}: {certified}");
+        assert!(certified.lattice_value < 1.0, "noise {noise}: {certified}");
+        assert_eq!(certified.doubt(), None, "noise {noise}: {certified}");
+    }
+}
+
+#[test]
+fn kernels_have_the_variance_of_the_noise() {
+    for noise in [0.0, 0.05, 0.3, 0.36, 0.5, 1.5, 4.0] {
+        let config = PointConfig { noise, ..PointConfig::default() };
+        let space = Space::new(&config, &Lattice { cell: 1.5, velocity: 0.5 }, 1);
+        let wide = (space.kernel.len() / 2) as f64;
+        let moment = |power: i32| -> f64 {
+            let nodes = space.kernel.iter().enumerate();
+            nodes.map(|(m, &w)| f64::from(w) * (0.5 * (m as f64 - wide)).powi(power)).sum()
+        };
+        assert_abs_diff_eq!(moment(0), 1.0, epsilon = 1e-6);
+        assert_abs_diff_eq!(moment(1), 0.0, epsilon = 1e-6);
+        // The lattice of v+ ends at four standard deviations.
+        assert_abs_diff_eq!(moment(2), noise * noise, epsilon = 2e-3 * noise * noise + 1e-9);
+    }
+}
+
+#[test]
+fn the_lattice_of_the_default_world_is_the_documented_one() {
+    let config = PointConfig::default();
+    assert_eq!(Lattice::of(&config), Lattice { cell: 0.1, velocity: 0.5 });
+    let far = PointConfig { horizon: 900, ..config };
+    let coarser = Lattice::of(&far);
+    assert!(coarser.cell > 0.1 && Space::bytes(&far, &coarser) < 3e9, "{coarser:?}");
+}
+
+/// A script that is best is what is certified: a world of one step, in which nothing can be done.
+#[test]
+fn no_script_is_better_than_the_answer() {
+    let config = PointConfig { horizon: 1, ..PointConfig::default() };
+    let certified = quick(&config, 25.0);
+    assert_eq!(certified.certified_cvar, -0.035, "{certified}");
+}
+
+#[test]
+fn a_contradiction_is_told() {
+    let config = short();
+    let mut certified = certify(&config, 1.0, 4.0, &small_effort(), &()).expect("valid");
+    certified.lattice_value = certified.certified_cvar;
+    assert!(!certified.to_string().contains("WARNING"), "{certified}");
+    certified.lattice_value += 1.01 * certified.lattice_error
+        + 1.01 * 0.75 * (certified.certified_cvar_hi - certified.certified_cvar_lo);
+    assert!(certified.to_string().contains("WARNING"), "{certified}");
+}
+
+#[test]
+fn progress_goes_from_nothing_to_all() {
+    struct Seen(std::sync::Mutex<Vec<f64>>);
+    impl Watch for Seen {
+        fn done(&self, share: f64) {
+            self.0.lock().unwrap().push(share);
+        }
+    }
+    let seen = Seen(std::sync::Mutex::new(Vec::new()));
+    let effort = Effort { threads: 1, ..small_effort() };
+    certify(&short(), 1.0, 4.0, &effort, &seen).expect("valid");
+    let seen = seen.0.into_inner().unwrap();
+    assert!(seen.is_sorted() && seen.len() > 50, "{seen:?}");
+    // Some thresholds of the search may need no look.
+    assert!(seen[0] < 0.1 && (0.7..=1.0).contains(seen.last().unwrap()), "{seen:?}");
+}
+
 #[test]
 fn bad_arguments_are_told() {
     let refused = |gamma: f64, eta: f64, lattice: Lattice| {
         let effort = Effort { lattice, ..small_effort() };
-        certify_with(&short(), gamma, eta, &effort).expect_err("out of range").to_string()
+        certify(&short(), gamma, eta, &effort, &()).expect_err("out of range").to_string()
     };
     assert!(refused(1.0, 0.5, COARSE).contains("0.5"));
     assert!(refused(0.0, 2.0, COARSE).contains("gamma"));
@@ -283,14 +371,14 @@ fn bad_arguments_are_told() {
 fn the_default_lattice_keeps_its_promises_and_a_finer_one_is_not_worse() {
     let config = PointConfig::default();
     let coarser = Lattice { cell: 0.2, velocity: 0.5 };
-    let effort = Effort { baseline_episodes: 20_000, ..Effort::default() };
+    let effort = Effort::of(&config);
     let at = |eta: f64, lattice: Lattice| {
-        certify_with(&config, 1.0, eta, &Effort { lattice, ..effort.clone() }).expect("valid")
+        certify(&config, 1.0, eta, &Effort { lattice, ..effort.clone() }, &()).expect("valid")
     };
     for (eta, promised) in [(1.0, 0.35), (25.0, 0.06), (100.0, -0.03)] {
         let certified = at(eta, effort.lattice);
         assert!(certified.certified_cvar >= promised, "eta {eta}: {certified}");
-        let known = shipped(&config, 1.0, eta, &Effort::default()).expect("it is shipped");
+        let known = shipped(&config, 1.0, eta, &effort).expect("it is shipped");
         assert!((certified.certified_cvar - known.certified_cvar).abs() < 1e-6, "eta {eta}");
         for baseline in &certified.baselines {
             assert!(certified.certified_cvar_lo > baseline.cvar, "eta {eta}: {baseline:?}");

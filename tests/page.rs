@@ -75,6 +75,7 @@ fn figure_data(env: &str, neutral: bool) -> FigureData {
     } else {
         WorldData::Plane(PlaneData {
             trajectories: vec![vec![[0.5, 0.5], [1.5, 3.0]]],
+            bin: 0.5,
             bins: if neutral { [0, 0] } else { [20, 14] },
             shifts: if neutral { Vec::new() } else { vec![shifts; 3] },
         })
@@ -94,9 +95,11 @@ fn figure_data(env: &str, neutral: bool) -> FigureData {
         if neutral { vec![Chance::Nominal] } else { vec![Chance::Nominal, Chance::Antagonist] };
     FigureData {
         schema: SCHEMA,
+        run: None,
         episodes: 1000,
         world,
         budget: (!neutral).then(|| BudgetByTime {
+            every: 1,
             running: vec![1000, 900],
             mean: vec![1.0, 0.4],
             low: vec![1.0, 0.1],
@@ -181,10 +184,12 @@ fn figures_name_methods_and_variants() {
             }
         }
     }
-    let other = dir.path().join("lava-point/mine/eta-25/seed-1/config.toml");
-    let text = fs::read_to_string(&other).unwrap().replace("noise = 1.5", "noise = 0.5");
-    assert!(text.contains("noise = 0.5"), "{text}");
-    fs::write(&other, text).unwrap();
+    for seed in [1, 2] {
+        let other = dir.path().join(format!("lava-point/mine/eta-25/seed-{seed}/config.toml"));
+        let text = fs::read_to_string(&other).unwrap().replace("noise = 1.5", "noise = 0.5");
+        assert!(text.contains("noise = 0.5"), "{text}");
+        fs::write(&other, text).unwrap();
+    }
     let written = report::write_all(dir.path(), standard()).unwrap();
     let svg = |name: &str| {
         let drawn = written.figures.drawn.iter().find(|figure| figure.name == name);

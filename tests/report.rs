@@ -4,6 +4,7 @@ use cvar_game::experiment::archive;
 use cvar_game::experiment::artefacts::{
     Audit, Certificate, Chance, Evaluation, Manifest, Play, SCHEMA,
 };
+use cvar_game::experiment::registry::standard;
 use cvar_game::game::returns::{Atom, ReturnLaw};
 use cvar_game::learn::policy::Mode;
 use cvar_game::report::{self, ReportError};
@@ -11,6 +12,9 @@ use lava_envs::End;
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
 use std::path::{Path, PathBuf};
+
+/// Columns of text of the terminal.
+const WIDTH: usize = 140;
 
 const STEP: f64 = -0.035;
 
@@ -73,8 +77,10 @@ fn manifest(dir: &Path, env: &str, eta: f64, seed: u64, failure: Option<&str>) {
         libtorch: Some("2.13.0".to_owned()),
         device: "cpu".to_owned(),
         cpu: "a processor".to_owned(),
+        cores: Some(2),
         seconds: 3.0,
         steps: 250_000,
+        notes: Vec::new(),
         failure: failure.map(str::to_owned),
     };
     let folder = folder(dir, env, eta, seed);
@@ -179,7 +185,7 @@ fn row<'a>(
 fn a_realistic_folder_makes_the_golden_table() {
     let dir = tempfile::tempdir().unwrap();
     realistic(dir.path());
-    let terminal = report::write(dir.path()).unwrap();
+    let terminal = report::write(dir.path(), standard(), WIDTH).unwrap();
     let markdown = fs::read_to_string(dir.path().join("table.md")).unwrap();
     insta::assert_snapshot!("terminal", terminal);
     insta::assert_snapshot!("markdown", markdown);
@@ -195,7 +201,7 @@ fn the_terminal_table_fits_140_columns() {
     realistic_of(dir.path(), 10);
     fs::remove_file(dir.path().join("lava-grid/eta-25/seed-10/evaluation.json")).unwrap();
     manifest(dir.path(), "lava-grid", 25.0, 10, Some("update 17: loss of the antagonist is NaN"));
-    let terminal = report::write(dir.path()).unwrap();
+    let terminal = report::write(dir.path(), standard(), WIDTH).unwrap();
     assert!(terminal.contains("IQM"));
     let widest = terminal.lines().map(|line| line.chars().count()).max().unwrap();
     assert!(widest <= 140, "the terminal table is {widest} columns wide:\n{terminal}");
@@ -206,7 +212,7 @@ fn the_same_artefacts_give_the_same_bytes() {
     let dir = tempfile::tempdir().unwrap();
     realistic(dir.path());
     let read = || {
-        let terminal = report::write(dir.path()).unwrap();
+        let terminal = report::write(dir.path(), standard(), WIDTH).unwrap();
         let files = ["runs.csv", "table.csv", "table.md", "cross.csv"];
         (terminal, files.map(|file| fs::read(dir.path().join(file)).unwrap()))
     };
@@ -239,7 +245,7 @@ fn numbers_of_a_run_are_the_known_ones() {
         antagonist_gap_standard_error: 0.0,
     });
     store(dir.path(), &run);
-    report::write(dir.path()).unwrap();
+    report::write(dir.path(), standard(), WIDTH).unwrap();
     let rows = csv(dir.path(), "runs.csv");
     let found = row(&rows, &[("env", "lava-point"), ("eta", "100"), ("seed", "7")]);
     for (key, expected) in [
@@ -278,7 +284,7 @@ fn cross_matrix_has_every_policy_at_every_alpha() {
         let plays = vec![play(Mode::Greedy, Chance::Nominal, law)];
         store(dir.path(), &evaluation("lava-grid", 3.0, seed, plays));
     }
-    report::write(dir.path()).unwrap();
+    report::write(dir.path(), standard(), WIDTH).unwrap();
     let rows = csv(dir.path(), "cross.csv");
     for (alpha, cvar) in [("1", 0.96), ("0.5", 0.92), ("0.1", 0.6), ("0.04", 0.0), ("0.01", -1.0)] {
         let found = row(&rows, &[("eta", "3"), ("alpha", alpha)]);
@@ -300,7 +306,7 @@ fn differences_are_paired_by_seed_and_level() {
             store(dir.path(), &evaluation("lava-point", eta, seed, plays));
         }
     }
-    report::write(dir.path()).unwrap();
+    report::write(dir.path(), standard(), WIDTH).unwrap();
     let rows = csv(dir.path(), "table.csv");
     let found = row(&rows, &[("eta", "2")]);
     // One episode of 100 between -1 and 1 moves CVaR_{1/2} by 0.04: differences 0.04 and 0.12.
@@ -326,7 +332,7 @@ fn an_event_that_never_happened_has_wilsons_interval() {
         let plays = vec![play(Mode::Greedy, Chance::Nominal, law)];
         store(dir.path(), &evaluation("lava-point", 1.0, seed, plays));
     }
-    report::write(dir.path()).unwrap();
+    report::write(dir.path(), standard(), WIDTH).unwrap();
     let rows = csv(dir.path(), "table.csv");
     assert_eq!((rows[0]["lava"].as_str(), rows[0]["lava_lo"].as_str()), ("0.000000", "0.000000"));
     assert_eq!(rows[0]["lava_hi"], "0.003827");
@@ -338,7 +344,7 @@ fn failed_runs_stay_in_and_rank_last() {
     realistic(dir.path());
     fs::remove_file(dir.path().join("lava-grid/eta-25/seed-2/evaluation.json")).unwrap();
     manifest(dir.path(), "lava-grid", 25.0, 2, Some("update 17: loss of the antagonist is NaN"));
-    let terminal = report::write(dir.path()).unwrap();
+    let terminal = report::write(dir.path(), standard(), WIDTH).unwrap();
     let runs = csv(dir.path(), "runs.csv");
     let failed = row(&runs, &[("env", "lava-grid"), ("eta", "25"), ("seed", "2")]);
     assert_eq!((failed["status"].as_str(), failed["steps"].as_str()), ("failed", "250000"));
@@ -363,7 +369,7 @@ fn a_run_in_progress_is_left_out_and_mentioned() {
     fs::create_dir_all(dir.path().join("lava-grid/eta-100/seed-4")).unwrap();
     fs::create_dir_all(dir.path().join("lava-grid/eta-many/seed-4")).unwrap();
     fs::create_dir_all(dir.path().join("figures")).unwrap();
-    let terminal = report::write(dir.path()).unwrap();
+    let terminal = report::write(dir.path(), standard(), WIDTH).unwrap();
     assert!(terminal.contains("lava-grid/eta-100/seed-4, lava-grid/eta-25/seed-3"), "{terminal}");
     assert!(terminal.contains("lava-grid/eta-many left out"), "{terminal}");
     assert_eq!(csv(dir.path(), "runs.csv").len(), 17);
@@ -378,7 +384,7 @@ fn a_leaking_or_violated_budget_is_shouted() {
     run.audit.as_mut().unwrap().violations = 3;
     run.plays[3].law = recorded(&[(End::Lava, 4, 1000)]);
     store(dir.path(), &run);
-    let terminal = report::write(dir.path()).unwrap();
+    let terminal = report::write(dir.path(), standard(), WIDTH).unwrap();
     assert!(
         terminal.contains("BUDGET VIOLATED: lava-grid/eta-25/seed-1, 3 violations"),
         "{terminal}"
@@ -391,13 +397,13 @@ fn a_leaking_or_violated_budget_is_shouted() {
 fn json_has_every_row_and_says_null_where_there_is_no_number() {
     let dir = tempfile::tempdir().unwrap();
     realistic(dir.path());
-    let value = report::table_json(dir.path(), &[]).unwrap();
+    let value = report::table_json(dir.path(), &[], standard()).unwrap();
     assert_eq!(value["schema"], SCHEMA);
     let rows = value["worlds"][0]["rows"].as_array().unwrap();
     assert_eq!(rows.len(), 3);
     assert!(rows[1]["cvar"]["low"].as_f64() <= rows[1]["cvar"]["value"].as_f64());
     assert!(rows[0]["gain"].is_null());
-    assert!(value["worlds"][1]["rows"][1]["regret"].is_null());
+    assert!(value["worlds"][1]["rows"][1]["antagonist_gap"].is_null());
     assert!(!dir.path().join("table.csv").exists(), "asking for JSON writes nothing");
 }
 
@@ -406,7 +412,7 @@ fn spoilt(spoil: impl FnOnce(&Path)) -> (String, usize) {
     let dir = tempfile::tempdir().unwrap();
     realistic(dir.path());
     spoil(dir.path());
-    let terminal = report::write(dir.path()).unwrap();
+    let terminal = report::write(dir.path(), standard(), WIDTH).unwrap();
     let text = terminal.split_whitespace().collect::<Vec<_>>().join(" ");
     (text, csv(dir.path(), "runs.csv").len())
 }
@@ -493,7 +499,7 @@ fn a_run_in_two_folders_is_refused() {
         fs::create_dir_all(world.join(twin)).unwrap();
         let file = "evaluation.json";
         fs::copy(world.join("eta-25/seed-1").join(file), world.join(twin).join(file)).unwrap();
-        let error = report::write(dir.path()).unwrap_err().to_string();
+        let error = report::write(dir.path(), standard(), WIDTH).unwrap_err().to_string();
         assert!(error.contains("two folders hold lava-grid/eta-25/seed-1"), "{error}");
         assert!(!dir.path().join("runs.csv").exists(), "nothing is written after {error}");
         fs::remove_dir_all(world.join(twin)).unwrap();
@@ -503,18 +509,18 @@ fn a_run_in_two_folders_is_refused() {
 #[test]
 fn a_folder_without_runs_says_what_is_expected() {
     let dir = tempfile::tempdir().unwrap();
-    let error = report::write(dir.path()).unwrap_err();
+    let error = report::write(dir.path(), standard(), WIDTH).unwrap_err();
     assert!(matches!(error, ReportError::NoRuns { .. }));
     assert!(error.to_string().contains("WORLD/METHOD/eta-E/seed-N"), "{error}");
     folder(dir.path(), "lava-grid", 1.0, 1);
-    let error = report::write(dir.path()).unwrap_err();
+    let error = report::write(dir.path(), standard(), WIDTH).unwrap_err();
     assert!(error.to_string().contains("in progress"), "{error}");
-    let error = report::write(&dir.path().join("nowhere")).unwrap_err();
+    let error = report::write(&dir.path().join("nowhere"), standard(), WIDTH).unwrap_err();
     assert!(matches!(error, ReportError::Read { .. }) && error.to_string().contains("nowhere"));
     // Of one damaged run nothing is left to report.
     store(dir.path(), &evaluation("lava-grid", 1.0, 1, Vec::new()));
     fs::write(dir.path().join("lava-grid/eta-1/seed-1/evaluation.json"), "{").unwrap();
-    let error = report::write(dir.path()).unwrap_err();
+    let error = report::write(dir.path(), standard(), WIDTH).unwrap_err();
     assert!(matches!(error, ReportError::Corrupt { .. }), "{error}");
     assert_eq!(error.to_string().lines().count(), 1, "{error}");
 }
@@ -533,7 +539,8 @@ fn folders_are_put_side_by_side() {
             fs::write(folder.join("episodes.csv"), text).unwrap();
         }
     }
-    let terminal = report::write_comparison(&ours, std::slice::from_ref(&theirs)).unwrap();
+    let terminal =
+        report::write_comparison(&ours, std::slice::from_ref(&theirs), standard(), WIDTH).unwrap();
     let rows = csv(&ours, "comparison.csv");
     let (first, second) = (row(&rows, &[("folder", "ours")]), row(&rows, &[("folder", "theirs")]));
     // An episode of 100 between -1 and 1 moves CVaR_{1/2} by 0.04; ten more are lost at every seed.
@@ -554,7 +561,7 @@ fn folders_are_put_side_by_side() {
     let latex = fs::read_to_string(ours.join("comparison.tex")).unwrap();
     assert!(latex.contains("\\textbf{0.920}") && !latex.contains("\\textbf{0.520}"), "{latex}");
     fs::write(theirs.join("lava-point/eta-2/seed-2/episodes.csv"), "return,steps\n1,2\n").unwrap();
-    let said = report::write_comparison(&ours, &[theirs]).unwrap();
+    let said = report::write_comparison(&ours, &[theirs], standard(), WIDTH).unwrap();
     let said = said.split_whitespace().collect::<Vec<_>>().join(" ");
     assert!(said.contains("! theirs: LEFT OUT: lava-point/eta-2/seed-2."), "{said}");
     assert!(said.contains("episodes.csv") && said.contains("missing field `end`"), "{said}");
@@ -577,7 +584,7 @@ fn methods_and_variants_of_one_folder_are_compared() {
         }
     };
     names[..2].iter().for_each(|(name, lost)| lose(name, *lost));
-    report::write(dir.path()).unwrap();
+    report::write(dir.path(), standard(), WIDTH).unwrap();
     let rows = csv(dir.path(), "table.csv");
     let names_of = |rows: &[BTreeMap<String, String>]| -> Vec<String> {
         rows.iter().map(|row| row["method"].clone()).collect()
@@ -588,7 +595,7 @@ fn methods_and_variants_of_one_folder_are_compared() {
         "only one method: its variants need no other name"
     );
     names[2..].iter().for_each(|(name, lost)| lose(name, *lost));
-    let terminal = report::write(dir.path()).unwrap();
+    let terminal = report::write(dir.path(), standard(), WIDTH).unwrap();
     let rows = csv(dir.path(), "table.csv");
     assert_eq!(names_of(&rows), ["game", "game/k-1", "mine"]);
     // An episode of 100 between -1 and 1 moves CVaR_{1/2} by 0.04.
@@ -604,14 +611,14 @@ fn methods_and_variants_of_one_folder_are_compared() {
     );
     row(&runs, &[("method", "mine"), ("variant", ""), ("seed", "1")]);
     assert_eq!(csv(dir.path(), "cross.csv").len(), 21);
-    let json = report::table_json(dir.path(), &[]).unwrap();
+    let json = report::table_json(dir.path(), &[], standard()).unwrap();
     let of = &json["worlds"][0]["rows"][1];
     assert_eq!((of["method"].as_str(), of["variant"].as_str()), (Some("game"), Some("k-1")));
 }
 
 /// What `write` leaves in a folder, but for the folders of runs and the archive.
 fn written(dir: &Path) -> BTreeMap<String, Vec<u8>> {
-    report::write(dir).unwrap();
+    report::write(dir, standard(), WIDTH).unwrap();
     let names = ["runs.csv", "table.csv", "table.md", "table.tex", "cross.csv"];
     names.into_iter().map(|name| (name.to_owned(), fs::read(dir.join(name)).unwrap())).collect()
 }
@@ -671,14 +678,14 @@ fn damaged_archives_and_members_are_named() {
     let mut bytes = sound.clone();
     bytes[200] ^= 0xff;
     fs::write(&path, &bytes).unwrap();
-    let said = report::write(dir.path()).unwrap();
+    let said = report::write(dir.path(), standard(), WIDTH).unwrap();
     let said = said.split_whitespace().collect::<Vec<_>>().join(" ");
     assert!(said.contains("LEFT OUT: lava-grid/eta-1/seed-1."), "{said}");
     assert!(said.contains("runs.zip/lava-grid/eta-1/seed-1/"), "{said}");
     assert_eq!(csv(dir.path(), "runs.csv").len(), 17);
     for bytes in [&sound[..sound.len() / 2], b"not an archive"] {
         fs::write(&path, bytes).unwrap();
-        let error = report::write(dir.path()).unwrap_err().to_string();
+        let error = report::write(dir.path(), standard(), WIDTH).unwrap_err().to_string();
         assert!(error.contains("runs.zip"), "{error}");
         assert!(archive::pack(dir.path(), false).is_err());
     }
@@ -699,7 +706,7 @@ fn a_bomb_in_an_archive_is_refused() {
     // Names that lead out of the folder are no runs.
     bomb.start_file("../../lava-grid/eta-25/seed-78/evaluation.json", options).unwrap();
     bomb.finish().unwrap();
-    let said = report::write(dir.path()).unwrap();
+    let said = report::write(dir.path(), standard(), WIDTH).unwrap();
     assert!(
         said.contains("LEFT OUT: lava-grid/eta-25/seed-77") && said.contains("larger than"),
         "{said}"
@@ -729,10 +736,12 @@ fn the_latex_tables_compile_and_fit() {
     let dir = tempfile::tempdir().unwrap();
     realistic_of(dir.path(), 10);
     manifest(dir.path(), "lava-grid", 25.0, 11, Some("100 % of \\ {broken} $ & _ # ~ ^"));
-    report::write(dir.path()).unwrap();
+    report::write(dir.path(), standard(), WIDTH).unwrap();
     report::write_comparison(
         dir.path(),
         &[dir.path().join("../").join(dir.path().file_name().unwrap())],
+        standard(),
+        WIDTH,
     )
     .unwrap();
     let document = "\\documentclass{article}\\usepackage{booktabs,graphicx}\\begin{document}\n\

@@ -54,10 +54,14 @@ fn sweep(
         told.push(match event {
             Event::Started { run, .. } => format!("{} started", run.seed),
             Event::Ticked { run, tick } => format!("{} at {}", run.seed, tick.steps),
+            Event::Evaluating { run, evaluated } => {
+                format!("{} evaluated on {}", run.seed, evaluated.episodes)
+            }
             Event::Noted { run, note } => format!("{} noted: {note}", run.seed),
             Event::Finished { run, .. } => format!("{} finished", run.seed),
             Event::Failed { run, reason, .. } => format!("{} failed: {reason}", run.seed),
             Event::Stopped { run } => format!("{} stopped", run.seed),
+            Event::Quiet => return,
         });
     };
     let prepared = prepare(config, out).unwrap();
@@ -329,10 +333,22 @@ fn folders_of_other_schema_versions_are_refused() {
 fn folders_with_something_else_are_refused() {
     let remove = |folder: &Path| fs::remove_file(folder.join("config.toml")).unwrap();
     assert!(refusal(remove, &config(&[1])).contains("holds files but no config.toml"));
-    let cut = |folder: &Path| fs::write(folder.join("evaluation.json"), "{\"sche").unwrap();
-    assert!(refusal(cut, &config(&[1])).contains("has a damaged evaluation.json"));
     let nonsense = |folder: &Path| fs::write(folder.join("config.toml"), "schema = 1\nx").unwrap();
     assert!(refusal(nonsense, &config(&[1])).contains("does not fit this program"));
+}
+
+#[test]
+fn a_damaged_evaluation_is_told_and_the_run_done_again() {
+    let out = tempfile::tempdir().unwrap();
+    let config = config(&[1, 2]);
+    sweep(&config, out.path(), 1, &Mock(succeed), &Stop::default());
+    let path = run_folder(out.path(), 1).join("evaluation.json");
+    fs::write(&path, "{\"sche").unwrap();
+    let (outcome, told) = sweep(&config, out.path(), 1, &Mock(succeed), &Stop::default());
+    assert_eq!(outcome, Outcome { finished: 1, ..Outcome::default() });
+    let note = format!("1 noted: {} is damaged", path.display());
+    assert!(told[1].starts_with(&note), "{told:?}");
+    assert_eq!((&told[0][..], &told[3][..]), ("1 started", "1 finished"));
 }
 
 #[test]

@@ -69,3 +69,24 @@ pub fn require(
         Err(ConfigError::value(field, value, allowed))
     }
 }
+
+/// Requires a step cost, rewards and a time limit with which no return overflows.
+///
+/// # Errors
+/// Names the first one that is out of range.
+pub fn require_rewards(
+    step_cost: f64,
+    goal_reward: f64,
+    lava_reward: f64,
+    horizon: u32,
+) -> Result<(), ConfigError> {
+    let cost = |cost: f64| (0.0..=1e6).contains(&cost);
+    require("step_cost", step_cost, cost, "in [0, 1000000] (it is subtracted)")?;
+    for (field, reward) in [("goal_reward", goal_reward), ("lava_reward", lava_reward)] {
+        require(field, reward, |reward| reward.abs() <= 1e6, "in [-1000000, 1000000]")?;
+    }
+    if !(1..=1_000_000).contains(&horizon) {
+        return Err(ConfigError::value("horizon", horizon, "from 1 to 1000000 steps"));
+    }
+    Ok(())
+}

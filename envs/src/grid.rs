@@ -11,12 +11,12 @@
 //! (arXiv 2109.09470).
 
 use crate::action::{Action, Discrete, Finite, uniform_index};
-use crate::error::{ConfigError, NoSuchState, require};
+use crate::error::{ConfigError, NoSuchState, require, require_rewards};
 use crate::finite::FiniteModel;
 use crate::law::FiniteLaw;
 use crate::map::{Map, Tile};
 use crate::scene::{Area, AreaKind, Field, Scene};
-use crate::world::{End, Step, World};
+use crate::world::{End, Step, World, return_range};
 use rand::Rng;
 use serde::{Deserialize, Serialize};
 
@@ -27,7 +27,8 @@ pub const MOVES: usize = 4;
 const DEFAULTS: &str = r#"# lava-grid: a walk over the cells of a map, with slips. Lengths are in cells.
 
 # The map: S start (one), G goal, L lava, . free, # wall. The paper's 10 x 7 cells. Rows are equally
-# long; white space around them does not count.
+# long; white space around them does not count. A way past lava and walls leads to a goal within the
+# time limit.
 map = """
 S.LLLLLL.G
 ..LLLLLL..
@@ -43,19 +44,20 @@ S.LLLLLL.G
 slip = 0.05
 
 # What a step costs that ends in neither goal nor lava: it is subtracted. The paper's 0.035.
-# Range: [0, inf)
+# Range: [0, 1000000]
 step_cost = 0.035
 
 # Reward on entering a goal, which ends the episode.
-# Range: (-inf, inf)
+# Range: [-1000000, 1000000]
 goal_reward = 1.0
 
 # Reward on entering lava, which ends the episode.
-# Range: (-inf, inf)
+# Range: [-1000000, 1000000]
 lava_reward = -1.0
 
-# Time limit T in steps. A true end of the episode: nothing is bootstrapped. The paper's 40.
-# Range: [1, 4294967295]
+# Time limit T in steps. A true end of the episode: nothing is bootstrapped. The paper's 40. At least the
+# moves of the shortest way to a goal.
+# Range: [1, 1000000]
 horizon = 40
 "#;
 
@@ -88,19 +90,29 @@ impl GridConfig {
     /// Checks every value.
     ///
     /// # Errors
-    /// Names the first field that is out of range, its value and the range, or the place in the map.
+    /// Names the first field that is out of range, its value and the range, or the place in the map. A map
+    /// whose goals cannot be reached in time is refused too, though [`LavaGrid`] can be made of it.
     pub fn validate(&self) -> Result<(), ConfigError> {
-        self.parse().map(|_| ())
+        let map = self.parse()?;
+        let Some(moves) = map.moves_to_goal() else {
+            let (x, y) = map.coordinates(map.start());
+            return Err(ConfigError::Map {
+                row: y + 1,
+                column: x + 1,
+                problem: "no way past lava and walls leads from this start to a goal".into(),
+                remedy: "open one".into(),
+            });
+        };
+        if moves > self.horizon as usize {
+            let allowed = format!("at least {moves}, the moves of the shortest way to a goal");
+            return Err(ConfigError::value("horizon", self.horizon, allowed));
+        }
+        Ok(())
     }
 
     fn parse(&self) -> Result<Map, ConfigError> {
         require("slip", self.slip, |p| (0.0..=1.0).contains(&p), "a probability in [0, 1]")?;
-        require("step_cost", self.step_cost, |cost| cost >= 0.0, "at least 0 (it is subtracted)")?;
-        require("goal_reward", self.goal_reward, |_| true, "a finite number")?;
-        require("lava_reward", self.lava_reward, |_| true, "a finite number")?;
-        if self.horizon == 0 {
-            return Err(ConfigError::value("horizon", self.horizon, "at least 1 step"));
-        }
+        require_rewards(self.step_cost, self.goal_reward, self.lava_reward, self.horizon)?;
         Map::parse(&self.map)
     }
 }
@@ -414,6 +426,11 @@ impl World for LavaGrid {
                  than the chosen one is executed."
             ),
         }
+    }
+
+    fn return_range(&self, gamma: f64) -> Option<[f64; 2]> {
+        let of = &self.config;
+        Some(return_range(of.step_cost, [of.goal_reward, of.lava_reward], of.horizon, gamma))
     }
 
     fn headline(&self) -> String {

@@ -120,6 +120,38 @@ impl Map {
         Ok(Map { width, tiles, start })
     }
 
+    /// Number of moves of the shortest way from the start to a goal that enters neither lava nor a wall;
+    /// `None` if there is no such way.
+    pub fn moves_to_goal(&self) -> Option<usize> {
+        let mut seen = vec![false; self.cells()];
+        seen[self.start] = true;
+        let (mut reached, mut moves) = (vec![self.start], 0);
+        while !reached.is_empty() {
+            if reached.iter().any(|&cell| self.tile(cell) == Tile::Goal) {
+                return Some(moves);
+            }
+            let near = reached.iter().flat_map(|&cell| self.neighbours(cell));
+            let free = |cell: &usize| matches!(self.tile(*cell), Tile::Free | Tile::Goal);
+            let new = |cell: &usize| !std::mem::replace(&mut seen[*cell], true);
+            reached = near.filter(free).filter(new).collect();
+            moves += 1;
+        }
+        None
+    }
+
+    /// The cells above, below, to the right and to the left that are on the map.
+    fn neighbours(&self, cell: usize) -> impl Iterator<Item = usize> + use<> {
+        let ((x, y), width) = (self.coordinates(cell), self.width);
+        let (right, down) = (x + 1 < width, y + 1 < self.height());
+        let all = [
+            (y > 0).then(|| cell - width),
+            down.then(|| cell + width),
+            right.then(|| cell + 1),
+            (x > 0).then(|| cell - 1),
+        ];
+        all.into_iter().flatten()
+    }
+
     /// Number of columns.
     pub fn width(&self) -> usize {
         self.width

@@ -24,7 +24,7 @@ use crate::action::{Action, Plane};
 use crate::error::{ConfigError, NoSuchState};
 use crate::law::GaussianLaw;
 use crate::scene::{Area, AreaKind, Field, Scene as Picture};
-use crate::world::{End, Step, World};
+use crate::world::{End, Step, World, return_range};
 use geometry::Scene;
 use nalgebra::Vector2;
 use physics::{Body, Physics};
@@ -156,7 +156,7 @@ impl World for LavaPoint {
     const SITUATION: usize = 4;
 
     fn new(config: &PointConfig, episodes: usize) -> Result<Self, ConfigError> {
-        config.validate()?;
+        config.check_values()?;
         let start = Body { position: vector(config.start), velocity: Vector::ZERO };
         Ok(LavaPoint {
             scene: Scene::new(config),
@@ -257,6 +257,11 @@ impl World for LavaPoint {
                 self.config.horizon, self.config.noise
             ),
         }
+    }
+
+    fn return_range(&self, gamma: f64) -> Option<[f64; 2]> {
+        let of = &self.config;
+        Some(return_range(of.step_cost, [of.goal_reward, of.lava_reward], of.horizon, gamma))
     }
 
     fn state_columns(&self, slot: usize) -> Vec<(&'static str, Field)> {

@@ -137,6 +137,12 @@ pub trait World: Sized + Send + Sync + 'static {
     /// The place where episodes happen, for figures.
     fn scene(&self) -> Scene;
 
+    /// The least and the greatest return that an episode can have, discounted by gamma per step; `None`
+    /// where the world does not say. Results from elsewhere are checked against it.
+    fn return_range(&self, _gamma: f64) -> Option<[f64; 2]> {
+        None
+    }
+
     /// The constants that results depend on most, in a few words, for the head of a page. Empty by
     /// default.
     fn headline(&self) -> String {
@@ -183,4 +189,40 @@ pub trait World: Sized + Send + Sync + 'static {
     /// have length [`World::episodes`]. A slot whose episode has ended stays as it is until it is
     /// reset and reports [`Step::IDLE`].
     fn apply(&mut self, actions: &[Self::Action], outcomes: &[Outcome<Self>], steps: &mut [Step]);
+}
+
+/// The least and the greatest return of an episode that costs `step_cost` in each step but the last, which
+/// pays one of `ends`, or that costs it in each of `horizon` steps.
+pub(crate) fn return_range(step_cost: f64, ends: [f64; 2], horizon: u32, gamma: f64) -> [f64; 2] {
+    // sum_{t < steps} gamma^t and gamma^steps.
+    let discounts = |steps: u32| {
+        let last = gamma.powf(f64::from(steps));
+        let sum = if gamma < 1.0 { (1.0 - last) / (1.0 - gamma) } else { f64::from(steps) };
+        (sum, last)
+    };
+    // In between, the return is linear in gamma^t (without discount, in t).
+    let (all, _) = discounts(horizon);
+    let mut range = [-step_cost * all; 2];
+    for steps in [0, horizon - 1] {
+        let (sum, last) = discounts(steps);
+        for end in ends {
+            let value = last * end - step_cost * sum;
+            range = [range[0].min(value), range[1].max(value)];
+        }
+    }
+    range
+}
+
+#[cfg(test)]
+mod tests {
+    use super::return_range;
+
+    #[test]
+    fn the_range_of_returns_has_the_shortest_and_the_longest_episodes() {
+        let [least, greatest] = return_range(0.035, [1.0, -1.0], 40, 1.0);
+        assert!((least - (-1.0 - 39.0 * 0.035)).abs() < 1e-12 && greatest == 1.0);
+        // With gamma = 1/2 and two steps: -1, -1 - 1/2, or an end at once or after a step of cost 1.
+        assert_eq!(return_range(1.0, [4.0, -4.0], 2, 0.5), [-4.0, 4.0]);
+        assert_eq!(return_range(1.0, [-4.0, -8.0], 2, 0.5), [-8.0, -1.5]);
+    }
 }

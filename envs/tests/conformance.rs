@@ -227,10 +227,10 @@ conformance!(lava_point, LavaPoint);
 #[test]
 fn the_grid_conforms() {
     check::<LavaGrid>(&GridConfig::default());
-    let map = "S#.G\n.L..\n..#.\n".to_owned();
+    let map = "S#.G\n.L..\n...#\n".to_owned();
     check::<LavaGrid>(&GridConfig { map, slip: 0.5, ..GridConfig::default() });
     check::<LavaGrid>(&GridConfig {
-        map: "S.G".into(),
+        map: "SG.".into(),
         slip: 0.0,
         horizon: 1,
         ..GridConfig::default()

@@ -173,7 +173,7 @@ fn refusals_say_what_where_and_what_to_do() {
     );
     assert_eq!(
         value(GridConfig { step_cost: -0.035, ..GridConfig::default() }),
-        "step_cost = -0.035 is not allowed: at least 0 (it is subtracted)"
+        "step_cost = -0.035 is not allowed: in [0, 1000000] (it is subtracted)"
     );
     let infinite = GridConfig { goal_reward: f64::INFINITY, ..GridConfig::default() };
     assert!(value(infinite).starts_with("goal_reward = inf"));

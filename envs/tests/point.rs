@@ -405,7 +405,7 @@ fn refusals_name_field_value_and_range() {
         (PointConfig { velocity_retention: 1.1, ..base() }, "velocity_retention = 1.1"),
         (PointConfig { step_cost: -0.1, ..base() }, "step_cost = -0.1"),
         (PointConfig { goal_reward: f64::NAN, ..base() }, "goal_reward = NaN"),
-        (PointConfig { horizon: 0, ..base() }, "horizon = 0 is not allowed: at least 1 step"),
+        (PointConfig { horizon: 0, ..base() }, "horizon = 0 is not allowed: from 1 to 1000000"),
     ];
     for (config, expected) in cases {
         let message = refusal(&config);

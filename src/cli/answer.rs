@@ -1,4 +1,4 @@
-//! Answers on standard output, as text or as JSON.
+//! Answers on standard output, as text or as JSON, and messages on standard error.
 
 use anyhow::{Context, Result};
 use serde::Serialize;
@@ -35,4 +35,11 @@ pub fn print(text: &str) -> Result<ExitCode> {
         }
         _ => Ok(ExitCode::SUCCESS),
     }
+}
+
+/// Writes a line to standard error: progress, a note, an error. Where it cannot be written it is lost: no
+/// work ends because nobody can read about it.
+pub fn note(text: impl Display) {
+    // One write, so that lines of several programs in one file do not mix.
+    let _ = io::stderr().write_all(format!("{text}\n").as_bytes());
 }

@@ -1,7 +1,9 @@
 //! The arguments of the command line.
 
 use crate::experiment::artefacts::Chance;
-use crate::experiment::config::{Catalogue, Config, ConfigError, Setting, Source};
+use crate::experiment::config::{
+    BYTES_OF_AN_EPISODE, Catalogue, Config, ConfigError, MOST_EPISODES, Setting, Source,
+};
 use crate::experiment::names::{MethodName, RunId, WorldName};
 use crate::experiment::steps::Format;
 use crate::learn::device::Device;
@@ -9,6 +11,7 @@ use crate::learn::policy::Mode;
 use clap::{Args, Parser, Subcommand};
 use std::num::NonZeroUsize;
 use std::path::PathBuf;
+use std::str::FromStr;
 
 /// A benchmark for risk-sensitive reinforcement learning by games, with exact yardsticks.
 #[derive(Debug, Parser)]
@@ -51,6 +54,8 @@ pub enum Verb {
     Slurm(SlurmArgs),
     Envs(EnvsArgs),
     Config(PrintArgs),
+    Completions(CompletionsArgs),
+    Man(ManArgs),
     /// Carry out the run of a folder, for `bench`.
     #[command(hide = true)]
     Worker {
@@ -108,7 +113,7 @@ pub struct BenchArgs {
     #[arg(long, value_name = "DIR")]
     pub out: Option<PathBuf>,
     /// Runs at the same time, one thread each [default: the processor's cores].
-    #[arg(long, value_name = "N", value_parser = at_least_one)]
+    #[arg(long, value_name = "N", allow_negative_numbers = true, value_parser = at_least_one)]
     pub jobs: Option<NonZeroUsize>,
     /// Carry out only this run of the configuration and write no table: for schedulers, one task per run.
     #[arg(long, value_name = "RUN_ID")]
@@ -138,10 +143,10 @@ pub struct TrainArgs {
     #[arg(long, allow_negative_numbers = true)]
     pub eta: f64,
     /// Seed of all that is random, a whole number from 0.
-    #[arg(long, allow_negative_numbers = true, value_parser = clap::value_parser!(i64).range(0..))]
+    #[arg(long, allow_negative_numbers = true, value_parser = seed_of_training)]
     pub seed: i64,
     /// Environment steps.
-    #[arg(long, allow_negative_numbers = true)]
+    #[arg(long, allow_negative_numbers = true, value_parser = whole::<i64>)]
     pub steps: Option<i64>,
     /// Configuration file.
     #[arg(long, value_name = "FILE")]
@@ -174,10 +179,10 @@ pub struct EvaluateArgs {
     #[arg(long, value_enum, default_value_t = Chance::Nominal)]
     pub antagonist: Chance,
     /// Episodes of each play [default: as the run was evaluated].
-    #[arg(long, value_parser = clap::value_parser!(u64).range(1..))]
+    #[arg(long, allow_negative_numbers = true, value_parser = kept_episodes)]
     pub episodes: Option<u64>,
     /// Seed of the episodes [default: as the run was evaluated].
-    #[arg(long)]
+    #[arg(long, allow_negative_numbers = true, value_parser = whole::<u64>)]
     pub seed: Option<u64>,
     /// Answer as JSON.
     #[arg(long)]
@@ -190,19 +195,23 @@ pub struct EvaluateArgs {
 /// (grid: `x`, `y`, in cells; point: `x`, `y` in m, `vx`, `vy` in m/s), the chosen `action` (point:
 /// `action_x`, `action_y`, before it is scaled onto the unit disc), what chance decided (grid:
 /// `executed`, the move; point: `xi_x`, `xi_y`, the noise), its likelihood ratio `delta`, the remaining
-/// `budget` before the step, `reward`, `clearance` to lava after the step, and how the episode `end`ed
-/// with it (`goal`, `lava`, `timeout`, or empty). JSON: an object per step and line, with these names.
+/// `budget` before the step, `reward`, `clearance` to lava after the step, how the episode `end`ed
+/// with it (`goal`, `lava`, `timeout`, or empty), and the state after the step (`next_x`, `next_y`, and on
+/// lava-point `next_vx`, `next_vy`). JSON: an object per step and line, with these names.
 #[derive(Debug, Args)]
 #[command(after_help = "\
 Examples:
-  cvar-game rollout --run results/quick/lava-grid/game/eta-25/seed-1 --episodes 1000 > episodes.csv
-  cvar-game rollout --run results/quick/lava-point/game/eta-25/seed-1 --antagonist learned --format json")]
+  cvar-game rollout results/quick/lava-grid/game/eta-25/seed-1 --episodes 1000 > episodes.csv
+  cvar-game rollout results/quick/lava-point/game/eta-25/seed-1 --antagonist learned --format json")]
 pub struct RolloutArgs {
     /// Folder of the run.
-    #[arg(long, value_name = "DIR")]
-    pub run: PathBuf,
+    #[arg(value_name = "RUN_DIR", required_unless_present = "run")]
+    pub folder: Option<PathBuf>,
+    /// The same as an option, for scripts that were written for former versions.
+    #[arg(long, value_name = "DIR", hide = true, conflicts_with = "folder")]
+    pub run: Option<PathBuf>,
     /// Number of episodes.
-    #[arg(long, default_value_t = 100, value_parser = clap::value_parser!(u64).range(1..))]
+    #[arg(long, default_value_t = 100, allow_negative_numbers = true, value_parser = episodes)]
     pub episodes: u64,
     /// Format of the rows.
     #[arg(long, value_enum, default_value_t = Format::Csv)]
@@ -214,7 +223,7 @@ pub struct RolloutArgs {
     #[arg(long, value_enum, default_value_t = Chance::Nominal)]
     pub antagonist: Chance,
     /// Seed of the episodes [default: as the run was evaluated].
-    #[arg(long)]
+    #[arg(long, allow_negative_numbers = true, value_parser = whole::<u64>)]
     pub seed: Option<u64>,
 }
 
@@ -241,11 +250,11 @@ pub struct ExactArgs {
     /// Configuration file.
     #[arg(long, value_name = "FILE")]
     pub config: Option<PathBuf>,
-    /// lava-point: distance of the lattice's positions, in m [default: 0.1].
-    #[arg(long, value_name = "M")]
+    /// lava-point: distance of the lattice's positions, in m [default: fits the arena; 0.1 by default].
+    #[arg(long, value_name = "M", allow_negative_numbers = true)]
     pub cell: Option<f64>,
-    /// lava-point: distance of the lattice's velocities, in m/s [default: 0.5].
-    #[arg(long, value_name = "M/S")]
+    /// lava-point: distance of the lattice's velocities, in m/s [default: fits noise and acceleration; 0.5 by default].
+    #[arg(long, value_name = "M/S", allow_negative_numbers = true)]
     pub velocity: Option<f64>,
     /// lava-point: compute even if there is a certificate.
     #[arg(long)]
@@ -332,7 +341,7 @@ pub struct SlurmArgs {
     #[arg(long)]
     pub partition: Option<String>,
     /// Most tasks at a time [default: as many as the cluster gives].
-    #[arg(long, value_name = "N", value_parser = at_least_one)]
+    #[arg(long, value_name = "N", allow_negative_numbers = true, value_parser = at_least_one)]
     pub array_limit: Option<NonZeroUsize>,
     /// Another option of sbatch, such as --extra=--mem=2G. May be repeated.
     #[arg(long, value_name = "OPTION", allow_hyphen_values = true)]
@@ -374,6 +383,68 @@ pub struct PrintArgs {
     pub overrides: Overrides,
 }
 
+/// Print the completions of a shell for this program.
+#[derive(Debug, Args)]
+#[command(after_help = "\
+Examples:
+  cvar-game completions bash > ~/.local/share/bash-completion/completions/cvar-game
+  cvar-game completions fish > ~/.config/fish/completions/cvar-game.fish")]
+pub struct CompletionsArgs {
+    /// The shell.
+    #[arg(value_enum)]
+    pub shell: clap_complete::Shell,
+}
+
+/// Write the manual pages of this program and of each verb.
+#[derive(Debug, Args)]
+#[command(after_help = "\
+Examples:
+  cvar-game man --out ~/.local/share/man/man1")]
+pub struct ManArgs {
+    /// Output folder.
+    #[arg(long, value_name = "DIR")]
+    pub out: PathBuf,
+}
+
+/// A whole number; digits may be grouped, as in 100_000.
+fn whole<T: FromStr>(text: &str) -> Result<T, String> {
+    let refused = || "use a whole number, such as 100_000".to_owned();
+    let is_grouped = text.split('_').all(|group| !group.is_empty());
+    let digits = if is_grouped { text.replace('_', "") } else { return Err(refused()) };
+    digits.parse().map_err(|_| match digits.strip_prefix('-') {
+        Some(digits) if digits.bytes().all(|byte| byte.is_ascii_digit()) => {
+            "use a whole number that is not negative".to_owned()
+        }
+        _ if !digits.is_empty() && digits.bytes().all(|byte| byte.is_ascii_digit()) => {
+            "the number is too large".to_owned()
+        }
+        _ => refused(),
+    })
+}
+
 fn at_least_one(text: &str) -> Result<NonZeroUsize, String> {
-    text.parse().map_err(|_| "use a whole number of at least 1".to_owned())
+    whole(text).map_err(|_| "use a whole number of at least 1".to_owned())
+}
+
+/// The seed of a run, which is a TOML integer.
+fn seed_of_training(text: &str) -> Result<i64, String> {
+    let seed = whole(text)?;
+    if seed < 0 { Err("use a whole number that is not negative".to_owned()) } else { Ok(seed) }
+}
+
+fn episodes(text: &str) -> Result<u64, String> {
+    whole(text)
+        .and_then(|count| if count == 0 { Err("play at least 1".to_owned()) } else { Ok(count) })
+}
+
+/// Episodes that are all in memory at the end.
+fn kept_episodes(text: &str) -> Result<u64, String> {
+    let count = episodes(text)?;
+    if count > MOST_EPISODES {
+        let gigabytes = count as f64 * BYTES_OF_AN_EPISODE / 1e9;
+        return Err(format!(
+            "they would need about {gigabytes:.0} GB of memory; play at most {MOST_EPISODES}"
+        ));
+    }
+    Ok(count)
 }

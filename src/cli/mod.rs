@@ -27,7 +27,7 @@ pub fn main(registry: &Registry) -> ExitCode {
 /// The exit code of a result; an error is reported in one line.
 fn exit_code(result: Result<ExitCode>) -> ExitCode {
     result.unwrap_or_else(|error| {
-        eprintln!("error: {}", one_line(&error));
+        answer::note(format!("error: {}", one_line(&error)));
         ExitCode::from(BAD_INPUT)
     })
 }

@@ -3,8 +3,9 @@
 use crate::experiment::artefacts::{Chance, Evaluation, Play};
 use crate::experiment::names::RunId;
 use crate::game::budget::Eta;
-use crate::game::returns::ReturnLaw;
+use crate::game::returns::{NORMAL_95, ReturnLaw};
 use crate::learn::policy::Mode;
+use crate::report::statistics;
 use indicatif::HumanCount;
 use lava_envs::End;
 use serde::Serialize;
@@ -105,28 +106,65 @@ struct PlaySummary {
     chance: Chance,
     /// Number of episodes; `None` for an exact law.
     episodes: Option<u64>,
-    mean: f64,
-    /// Pairs of alpha and CVaR_alpha.
-    cvar: Vec<(f64, f64)>,
-    lava: f64,
-    goal: f64,
-    timeout: f64,
+    mean: Estimated,
+    /// Pairs of alpha and CVaR_alpha; `None` where its tail holds fewer than ten recorded episodes.
+    cvar: Vec<(f64, Option<Estimated>)>,
+    lava: Estimated,
+    goal: Estimated,
+    timeout: Estimated,
     /// The law of the return itself, atom by atom.
     law: ReturnLaw,
+}
+
+/// A number with its 95 % interval, which has no width for an exact law: of means and CVaR by their standard
+/// errors, of shares Wilson's.
+#[derive(Debug, Clone, Copy, Serialize)]
+struct Estimated {
+    value: f64,
+    low: f64,
+    high: f64,
+}
+
+impl Estimated {
+    fn normal(value: f64, standard_error: f64) -> Self {
+        let half = NORMAL_95 * standard_error;
+        Estimated { value, low: value - half, high: value + half }
+    }
+
+    /// The share of episodes that end so.
+    fn share(law: &ReturnLaw, end: End) -> Self {
+        let value = law.probability(end);
+        let interval =
+            law.episodes().and_then(|all| statistics::wilson(value * all as f64, all as f64));
+        let (low, high) = interval.map_or((value, value), |interval| (interval.low, interval.high));
+        Estimated { value, low, high }
+    }
+}
+
+impl Display for Estimated {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Estimated { value, low, high } = self;
+        write!(f, "{value:>8.4}")?;
+        if low < high { write!(f, "  [{low:.4}, {high:.4}]") } else { Ok(()) }
+    }
 }
 
 impl Plays {
     /// Of the plays of a run, with the CVaR at these levels.
     pub fn new(run: &RunId, plays: &[Play], alphas: &[f64]) -> Self {
+        let cvar = |law: &ReturnLaw, alpha| {
+            let value = statistics::cvar(law, alpha)?;
+            Some(Estimated::normal(value, law.cvar_standard_error(alpha)))
+        };
         let summary = |play: &Play| PlaySummary {
             protagonist: play.protagonist,
             chance: play.chance,
             episodes: play.law.episodes(),
-            mean: play.law.mean(),
-            cvar: alphas.iter().map(|&alpha| (alpha, play.law.cvar(alpha))).collect(),
-            lava: play.law.probability(End::Lava),
-            goal: play.law.probability(End::Goal),
-            timeout: play.law.probability(End::Timeout),
+            mean: Estimated::normal(play.law.mean(), play.law.mean_standard_error()),
+            cvar: alphas.iter().map(|&alpha| (alpha, cvar(&play.law, alpha))).collect(),
+            lava: Estimated::share(&play.law, End::Lava),
+            goal: Estimated::share(&play.law, End::Goal),
+            timeout: Estimated::share(&play.law, End::Timeout),
             law: play.law.clone(),
         };
         Plays { run: run.to_string(), plays: plays.iter().map(summary).collect() }
@@ -147,18 +185,26 @@ impl Display for Plays {
                 Chance::Exact => "under the exact antagonist",
             };
             let source = match play.episodes {
-                Some(episodes) => format!("{episodes} episodes"),
+                Some(1) => "1 episode, 95 % intervals".to_owned(),
+                Some(episodes) => format!("{episodes} episodes, 95 % intervals"),
                 None => "exact".to_owned(),
             };
             writeln!(f, "\n{protagonist} protagonist {chance}, {source}")?;
-            writeln!(f, "  mean      {:>8.4}", play.mean)?;
+            writeln!(f, "  mean      {}", play.mean)?;
             for &(alpha, cvar) in &play.cvar {
-                writeln!(f, "  {:<9} {cvar:>8.4}", format!("CVaR_{}", short(alpha)))?;
+                let label = format!("CVaR_{}", short(alpha));
+                match cvar {
+                    Some(cvar) => writeln!(f, "  {label:<9} {cvar}")?,
+                    None => {
+                        let needed = (statistics::TAIL_EPISODES / alpha - 1e-9).ceil();
+                        writeln!(f, "  {label:<9} needs at least {needed} episodes")?;
+                    }
+                }
             }
             for (end, share) in
                 [("goal", play.goal), ("lava", play.lava), ("timeout", play.timeout)]
             {
-                writeln!(f, "  {end:<9} {share:>8.4}")?;
+                writeln!(f, "  {end:<9} {share}")?;
             }
         }
         Ok(())

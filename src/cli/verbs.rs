@@ -1,16 +1,17 @@
 //! The verbs of the command line.
 
-use super::answer::{give, print, print_json};
+use super::answer::{give, note, print, print_json};
 use super::args::{
-    BenchArgs, Cli, EnvsArgs, EvaluateArgs, ExactArgs, FiguresArgs, PackArgs, PrintArgs,
-    RolloutArgs, SlurmArgs, TableArgs, TrainArgs, Verb,
+    BenchArgs, Cli, CompletionsArgs, EnvsArgs, EvaluateArgs, ExactArgs, FiguresArgs, ManArgs,
+    PackArgs, PrintArgs, RolloutArgs, SlurmArgs, TableArgs, TrainArgs, Verb,
 };
-use super::progress::Progress;
+use super::progress::{Counter, Meter, Progress, Watched};
 use super::summary;
 use crate::exact::yardstick;
 use crate::experiment::archive;
 use crate::experiment::config::catalogue::annotated_constants;
 use crate::experiment::config::{Config, RunConfig, Setting, Source};
+use crate::experiment::evaluation;
 use crate::experiment::failure::RunError;
 use crate::experiment::names::{MethodName, RunId, WorldName};
 use crate::experiment::plan;
@@ -20,12 +21,14 @@ use crate::experiment::runner::{
 };
 use crate::experiment::slurm::{self, SlurmOptions};
 use crate::experiment::stop::{self, Stop};
+use crate::experiment::words::counted;
 use crate::game::budget::Eta;
 use crate::learn::device::Device;
 use crate::report;
 use anyhow::{Context, Result, bail};
-use std::collections::BTreeMap;
-use std::io::{self, BufWriter};
+use clap::CommandFactory;
+use std::collections::{BTreeMap, BTreeSet};
+use std::io::{self, BufWriter, IsTerminal};
 use std::num::NonZeroUsize;
 use std::path::Path;
 use std::process::{Command, ExitCode};
@@ -39,26 +42,29 @@ const FAILED: u8 = 1;
 /// On bad input, before anything is overwritten.
 pub fn run(registry: &Registry, cli: Cli) -> Result<ExitCode> {
     match cli.verb {
-        Verb::Bench(args) => bench(registry, &args),
-        Verb::Train(args) => train(registry, &args),
+        Verb::Bench(args) => bench(registry, &args, &Stop::on_signals()?),
+        Verb::Train(args) => train(registry, &args, &Stop::on_signals()?),
         Verb::Evaluate(args) => evaluate(registry, &args),
         Verb::Rollout(args) => rollout(registry, &args),
         Verb::Exact(args) => exact(registry, &args),
-        Verb::Table(args) => table(&args),
+        Verb::Table(args) => table(registry, &args),
         Verb::Figures(args) => figures(registry, &args),
         Verb::Report(args) => report(registry, &args.folder),
         Verb::Pack(args) => pack(&args),
         Verb::Slurm(args) => slurm(registry, &args),
         Verb::Envs(args) => envs(registry, &args),
         Verb::Config(args) => config(registry, &args),
+        Verb::Completions(args) => completions(&args),
+        Verb::Man(args) => man(&args),
         Verb::Worker { folder } => {
             let (catalogue, carry_out) = (registry.catalogue(), carry_out(registry));
-            Ok(ExitCode::from(runner::work(catalogue, &folder, &carry_out)))
+            let stop = Stop::on_signals()?;
+            Ok(ExitCode::from(runner::work(catalogue, &folder, &stop, &carry_out)))
         }
     }
 }
 
-fn bench(registry: &Registry, args: &BenchArgs) -> Result<ExitCode> {
+fn bench(registry: &Registry, args: &BenchArgs, stop: &Stop) -> Result<ExitCode> {
     let options = args.device.map(device).into_iter().collect();
     let source = args.config.as_deref().map_or(Source::Quick, Source::File);
     let config = args.overrides.resolve(registry.catalogue(), source, options)?;
@@ -76,24 +82,33 @@ fn bench(registry: &Registry, args: &BenchArgs) -> Result<ExitCode> {
         }
         runs = vec![only.clone()];
     }
-    let prepared = prepare(registry, &config, &runs, &out)?;
+    let Some(prepared) = stop.interruptible(|| prepare(registry, &config, &runs, &out)) else {
+        return Ok(report_end(&stopped(stop)));
+    };
+    let prepared = prepared?;
     let jobs = match args.jobs {
         Some(jobs) => jobs,
         None => std::thread::available_parallelism().unwrap_or(NonZeroUsize::MIN),
     };
-    let stop = Stop::on_signals().context("cannot listen to signals")?;
-    let outcome = sweep(&prepared, jobs, &Workers::of_this_program()?, &stop);
+    let outcome = sweep(&prepared, jobs, &Workers::of_this_program()?, stop);
     let any_finished = outcome.finished + prepared.finished.len() > 0;
     let code = report_end(&outcome);
     if outcome.stopped.is_none() && args.only.is_none() && any_finished {
-        let written = report::write_all(&out, registry)?;
-        print(&written.table)?;
-        eprintln!("written to {}", out.display());
+        let Some(written) = stop.interruptible(|| report::write_all(&out, registry)) else {
+            return Ok(report_end(&stopped(stop)));
+        };
+        print(&written?.terminal(report::screen_width()))?;
+        note(format!("written to {}", out.display()));
     }
     Ok(code)
 }
 
-fn train(registry: &Registry, args: &TrainArgs) -> Result<ExitCode> {
+/// The outcome of a sweep that was stopped before or after its runs.
+fn stopped(stop: &Stop) -> Outcome {
+    Outcome { stopped: stop.signal(), ..Outcome::default() }
+}
+
+fn train(registry: &Registry, args: &TrainArgs, stop: &Stop) -> Result<ExitCode> {
     let mut options = vec![
         select(&args.env),
         budget(args.eta)?,
@@ -108,14 +123,16 @@ fn train(registry: &Registry, args: &TrainArgs) -> Result<ExitCode> {
     let [id] = &ids[..] else {
         bail!("the configuration has {} variants or methods; use `bench --only RUN_ID`", ids.len());
     };
-    let prepared = prepare(registry, &config, &ids, &args.out)?;
+    let Some(prepared) = stop.interruptible(|| prepare(registry, &config, &ids, &args.out)) else {
+        return Ok(report_end(&stopped(stop)));
+    };
+    let prepared = prepared?;
     let outcome = if prepared.todo.is_empty() {
-        eprintln!("{id} has finished before; remove its folder to run it again");
+        note(format!("{id} has finished before; remove its folder to run it again"));
         Outcome::default()
     } else {
-        let stop = Stop::on_signals().context("cannot listen to signals")?;
         let carry_out = carry_out(registry);
-        sweep(&prepared, NonZeroUsize::MIN, &InProcess(&carry_out), &stop)
+        sweep(&prepared, NonZeroUsize::MIN, &InProcess(&carry_out), stop)
     };
     let folder = id.folder(&args.out);
     let code = report_end(&outcome);
@@ -139,12 +156,21 @@ fn prepare<'a>(
     for run in &prepared.todo {
         run.device.require()?;
     }
+    say_what_is_rounded(&prepared);
     Ok(prepared)
+}
+
+/// Says, before anything is trained, which numbers of steps are rounded up.
+fn say_what_is_rounded(prepared: &Prepared) {
+    let of = |run: &RunConfig| Some(format!("note: {}", run.train.rounding()?));
+    let notes: BTreeSet<String> = prepared.todo.iter().filter_map(of).collect();
+    notes.iter().for_each(note);
 }
 
 /// Carries out the runs with progress on standard error.
 fn sweep(prepared: &Prepared, jobs: NonZeroUsize, launcher: &dyn Launcher, stop: &Stop) -> Outcome {
-    let mut progress = Progress::new(prepared.todo.len(), prepared.finished.len());
+    let todo = prepared.todo.iter().map(|run| (run.id(), run.train.whole_steps())).collect();
+    let mut progress = Progress::new(todo, prepared.finished.len());
     let outcome = runner::sweep(prepared, jobs, launcher, stop, &mut |event| progress.event(event));
     progress.finish();
     outcome
@@ -153,10 +179,10 @@ fn sweep(prepared: &Prepared, jobs: NonZeroUsize, launcher: &dyn Launcher, stop:
 /// Reports why runs did not finish; the exit code.
 fn report_end(outcome: &Outcome) -> ExitCode {
     for (run, reason) in &outcome.failed {
-        eprintln!("error: {run} failed: {reason}");
+        note(format!("error: {run} failed: {reason}"));
     }
     if let Some(signal) = outcome.stopped {
-        eprintln!("stopped; finished runs are kept, and the same command continues with the rest");
+        note("stopped; finished runs are kept, and the same command continues with the rest");
         return ExitCode::from(stop::exit_code(signal));
     }
     if outcome.failed.is_empty() { ExitCode::SUCCESS } else { ExitCode::from(FAILED) }
@@ -171,19 +197,42 @@ fn method(method: &MethodName) -> Setting {
 }
 
 fn evaluate(registry: &Registry, args: &EvaluateArgs) -> Result<ExitCode> {
-    let request = Request { chance: args.antagonist, episodes: args.episodes, seed: args.seed };
     let run = read_run(registry, &args.folder)?;
-    let plays = registry.world(&run.env)?.evaluate(&run, &args.folder, &request)?;
+    let episodes = args.episodes.unwrap_or(run.evaluation.episodes);
+    let all = episodes.saturating_mul(evaluation::modes(args.antagonist).len() as u64);
+    let meter = Counter::new(Meter::new("episodes", all));
+    let request = Request {
+        chance: args.antagonist,
+        episodes: args.episodes,
+        seed: args.seed,
+        progress: &|| meter.count(),
+    };
+    let plays = registry.world(&run.env)?.evaluate(&run, &args.folder, &request);
+    meter.finish();
+    let plays = plays?;
     give(&summary::Plays::new(&run.id(), &plays, &run.evaluation.alphas), args.json)
 }
 
 fn rollout(registry: &Registry, args: &RolloutArgs) -> Result<ExitCode> {
-    let run = read_run(registry, &args.run)?;
-    let (chance, episodes) = (args.antagonist, Some(args.episodes));
-    let request = Request { chance, episodes, seed: args.seed };
+    let folder = args.folder.as_ref().or(args.run.as_ref()).context("give the folder of a run")?;
+    let run = read_run(registry, folder)?;
     let rows = (args.protagonist, args.format);
     let output = &mut BufWriter::new(io::stdout().lock());
-    match registry.world(&run.env)?.rollout(&run, &args.run, &request, rows, output) {
+    // On a terminal the rows themselves show how far it is.
+    let meter = if io::stdout().is_terminal() {
+        Counter::silent()
+    } else {
+        Counter::new(Meter::new("episodes", args.episodes))
+    };
+    let request = Request {
+        chance: args.antagonist,
+        episodes: Some(args.episodes),
+        seed: args.seed,
+        progress: &|| meter.count(),
+    };
+    let result = registry.world(&run.env)?.rollout(&run, folder, &request, rows, output);
+    meter.finish();
+    match result {
         // A reader that stops reading (`| head`) is not an error.
         Err(RunError::Output(error)) if error.kind() == io::ErrorKind::BrokenPipe => {}
         result => result?,
@@ -251,18 +300,22 @@ fn exact(registry: &Registry, args: &ExactArgs) -> Result<ExitCode> {
         velocity: args.velocity,
     };
     let constants = &config.world(&args.env).constants;
-    let found = registry.world(constants)?.solve(constants, gamma, eta, &options)?;
+    let watched = Watched::new(&format!("{} at eta {eta}", args.env));
+    let found = registry.world(constants)?.solve(constants, gamma, eta, &options, &watched);
+    watched.finish();
+    let found = found?;
     print(&if args.json { found.json() } else { found.to_string() })
 }
 
-fn table(args: &TableArgs) -> Result<ExitCode> {
+fn table(registry: &Registry, args: &TableArgs) -> Result<ExitCode> {
     if args.json {
-        return print_json(&report::table_json(&args.folder, &args.compare)?);
+        return print_json(&report::table_json(&args.folder, &args.compare, registry)?);
     }
+    let width = report::screen_width();
     print(&if args.compare.is_empty() {
-        report::write(&args.folder)?
+        report::write(&args.folder, registry, width)?
     } else {
-        report::write_comparison(&args.folder, &args.compare)?
+        report::write_comparison(&args.folder, &args.compare, registry, width)?
     })
 }
 
@@ -270,8 +323,8 @@ fn figures(registry: &Registry, args: &FiguresArgs) -> Result<ExitCode> {
     let figures = report::write_figures(&args.folder, registry)?;
     report_missing(&figures);
     print(&format!(
-        "{} figures written to {}",
-        figures.drawn.len(),
+        "{} written to {}",
+        counted(figures.drawn.len() as u64, "figure"),
         args.folder.join("figures").display()
     ))
 }
@@ -285,13 +338,16 @@ fn report(registry: &Registry, folder: &Path) -> Result<ExitCode> {
 /// Says which figures the artefacts did not allow.
 fn report_missing(figures: &report::figures::Figures) {
     if !figures.missing.is_empty() {
-        eprintln!(
+        note(format!(
             "left out, because the runs have no data for them: {}",
             figures.missing.join("; ")
-        );
+        ));
     }
-    for note in &figures.notes {
-        eprintln!("missing in the figures: {note}");
+    for left_out in &figures.left_out {
+        note(left_out);
+    }
+    for missing in &figures.notes {
+        note(format!("missing in the figures: {missing}"));
     }
 }
 
@@ -299,6 +355,7 @@ fn slurm(registry: &Registry, args: &SlurmArgs) -> Result<ExitCode> {
     let catalogue = registry.catalogue();
     let config = args.overrides.resolve(catalogue, Source::File(&args.config), Vec::new())?;
     let prepared = runner::prepare(catalogue, &config, &plan::runs(&config), &args.out)?;
+    say_what_is_rounded(&prepared);
     if prepared.todo.is_empty() {
         return print("all runs are finished; `cvar-game table` makes their table");
     }
@@ -314,8 +371,9 @@ fn slurm(registry: &Registry, args: &SlurmArgs) -> Result<ExitCode> {
     let submit = slurm::write(&config, &runs, &args.out, &program, &options)
         .with_context(|| format!("cannot write to {}", args.out.display()))?;
     if !args.submit {
-        let (count, submit) = (runs.len(), submit.display());
-        return print(&format!("{count} runs to do; submit them with: sh '{submit}'"));
+        let (count, submit) =
+            (counted(runs.len() as u64, "run"), slurm::quoted(&submit.to_string_lossy()));
+        return print(&format!("{count} to do; submit with: sh {submit}"));
     }
     let status = Command::new("sh").arg(&submit).status().context("cannot start sh")?;
     if !status.success() {
@@ -344,6 +402,19 @@ fn config(registry: &Registry, args: &PrintArgs) -> Result<ExitCode> {
     let options = args.env.iter().map(select).collect();
     let source = Source::of(args.config.as_deref());
     print(&args.overrides.resolve(catalogue, source, options)?.to_toml())
+}
+
+fn completions(args: &CompletionsArgs) -> Result<ExitCode> {
+    let mut script = Vec::new();
+    clap_complete::generate(args.shell, &mut Cli::command(), "cvar-game", &mut script);
+    print(&String::from_utf8(script)?)
+}
+
+fn man(args: &ManArgs) -> Result<ExitCode> {
+    let written = std::fs::create_dir_all(&args.out)
+        .and_then(|()| clap_mangen::generate_to(Cli::command(), &args.out));
+    written.with_context(|| format!("cannot write to {}", args.out.display()))?;
+    print(&format!("manual pages written to {}", args.out.display()))
 }
 
 fn pack(args: &PackArgs) -> Result<ExitCode> {

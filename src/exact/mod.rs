@@ -13,6 +13,7 @@
 //! | all of it in any finite world | [`finite`] |
 //! | what can be attained certifiably on the point mass, where nothing is exact | [`oracle`] |
 //! | all of it for any world, by one interface | [`yardstick`] |
+//! | how far is a computation that takes minutes | [`mod@watch`] |
 //!
 //! Symbols: budget eta >= 1, risk level alpha = 1/eta, return J, threshold w, time t, state s, outcome
 //! of chance o, perturbation delta_t(o). Rewards and returns are in the world's reward units.
@@ -28,6 +29,7 @@ pub mod oracle;
 pub mod policy;
 pub mod stationary;
 pub mod table;
+pub mod watch;
 pub mod yardstick;
 
 /// Why a yardstick cannot be computed.

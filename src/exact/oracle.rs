@@ -18,21 +18,26 @@
 //!
 //!   max_pi CVaR_alpha(J) = max_w { w - (1/alpha) min_pi E[(w - J)^+] },
 //!
-//! with w among the returns of episodes that reach the goal or the time limit. The maximum over w is
-//! bracketed on a coarse lattice by its interpolated value; on the fine lattice the best candidates
-//! are played, and the controller with the best played CVaR is chosen. It is then played afresh, on
+//! with w among the returns of episodes that end. The maximum over w is searched on a coarse lattice by
+//! its interpolated value; on the fine lattice the best candidates are played, beside the best of some
+//! scripts, and whoever has the best played CVaR is chosen. What certifies is another play of it, on
 //! streams that had no part in the choice, so that the certificate is not biased by it.
 //! At eta = 1 there is no threshold: J itself is maximised, and the mean is the certificate.
+//!
+//! # How good is it
+//! The lattice fits the noise ([`Lattice::of`]). Its own value of the optimum is not certified, but a check:
+//! [`Certified::doubt`] tells where it contradicts the certificate.
 
 pub mod controller;
 pub mod lattice;
 pub mod play;
 pub mod sweep;
 
+use super::watch::{Steps, Watch};
 use super::{ExactError, require_eta};
-use crate::files::write_in_place;
-use crate::game::returns::ReturnLaw;
-use controller::{Controller, Scripted};
+use crate::files::{read_at_most, write_in_place};
+use crate::game::returns::{NORMAL_95, ReturnLaw};
+use controller::{Controller, Protagonist, Scripted};
 use etcetera::base_strategy::{BaseStrategy as _, Xdg};
 use lattice::Space;
 use lava_envs::{ConfigError, End, PointConfig};
@@ -40,25 +45,21 @@ use play::{Played, play};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::fmt::{self, Display, Formatter};
-use std::io;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
-use sweep::{Rewards, Utility, sweep};
+use sweep::{PLAYED, Rewards, Rings, SWEPT, Utility, sweep};
 
 /// Name of the world in certificates.
 pub const NAME: &str = "lava-point";
 
 /// Version of the method and of its file; certificates of other versions are computed again.
-const VERSION: u32 = 1;
+const VERSION: u32 = 2;
 
 /// Seed of the episodes that choose the threshold.
 const SELECTION_SEED: u64 = 0x5e1e_c710;
 
 /// Seed of the episodes that certify.
 const CERTIFYING_SEED: u64 = 0xce47_1f1e;
-
-/// Half-width of a 95 % interval in standard errors.
-const NORMAL_95: f64 = 1.959_963_984_540_054;
 
 /// Why there is no certificate.
 #[derive(Debug, thiserror::Error)]
@@ -84,29 +85,30 @@ pub enum OracleError {
     },
     /// The lattice needs too much memory.
     #[error(
-        "the oracle's tables would take {gibibytes:.1} GiB, more than {MOST_GIBIBYTES}; use a \
-         coarser lattice or a shorter horizon"
+        "the oracle's table would take {gibibytes:.1} GiB, more than {MOST_GIBIBYTES}; {advice}"
     )]
     TooLarge {
-        /// What they would take.
+        /// What it would take.
         gibibytes: f64,
-    },
-    /// The cache cannot be written.
-    #[error("cannot write {path}: {source}", path = path.display())]
-    Cache {
-        /// Which file or folder.
-        path: PathBuf,
-        /// Why.
-        source: io::Error,
+        /// What would fit.
+        advice: String,
     },
 }
 
-/// Most memory of the tables.
-const MOST_GIBIBYTES: f64 = 6.0;
+/// Most memory of the table of a controller.
+const MOST_GIBIBYTES: f64 = 2.5;
+
+const GIBIBYTE: f64 = (1_u64 << 30) as f64;
+
+/// Error of a programme in single precision, before it is divided by alpha.
+const ROUNDING: f64 = 1e-5;
+
+/// Who is played where no script is better.
+const CONTROLLER: &str = "lattice";
 
 /// Resolution of the programme.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
-#[serde(default, deny_unknown_fields)]
+#[serde(deny_unknown_fields)]
 pub struct Lattice {
     /// Distance of position nodes in m; rounded so that the nodes reach from wall to wall.
     pub cell: f64,
@@ -114,19 +116,58 @@ pub struct Lattice {
     pub velocity: f64,
 }
 
-impl Default for Lattice {
-    /// A tenth of a metre, so that nodes lie on the borders of the default world's lava and goal, and
-    /// a third of the default noise.
-    fn default() -> Self {
-        Lattice { cell: 0.1, velocity: 0.5 }
+impl Lattice {
+    /// The lattice of a world. Its velocities are a third of the noise apart, but at least a fifth of the
+    /// acceleration; its positions as many as the default world's at 0.1 m, where nodes lie on the borders of
+    /// its lava and goal, or as many as fit into memory.
+    pub fn of(config: &PointConfig) -> Lattice {
+        let [width, height] = config.arena;
+        let fine = (width * height / 7000.0).sqrt().min(widest(config));
+        let velocity = (config.noise / 3.0).max(config.acceleration / 5.0);
+        let mut lattice =
+            Lattice { cell: rounded(fine), velocity: if velocity > 0.0 { velocity } else { 1.0 } };
+        while lattice.cell < widest(config)
+            && Space::bytes(config, &lattice) > MOST_GIBIBYTES * GIBIBYTE
+        {
+            lattice.cell = rounded(1.25 * lattice.cell).min(widest(config));
+        }
+        lattice
+    }
+
+    /// The lattice on which thresholds are searched.
+    fn coarse(self, config: &PointConfig) -> Lattice {
+        Lattice { cell: (2.0 * self.cell).min(widest(config)), velocity: 1.5 * self.velocity }
+    }
+
+    fn check(self, config: &PointConfig) -> Result<(), OracleError> {
+        let widest = widest(config);
+        if !(self.cell > 0.0 && self.cell <= widest) {
+            let allowed = format!("above 0 and at most {widest} m, a quarter of the shorter side");
+            return Err(OracleError::Lattice { field: "cell", value: self.cell, allowed });
+        }
+        // The window of a controller bounds one end; the other is where pushes and noise are lost between nodes.
+        let finest = config.acceleration / 14.0;
+        let coarsest = config.acceleration.max(config.noise);
+        if !(self.velocity > finest && (self.velocity <= coarsest || coarsest == 0.0)) {
+            let allowed = format!(
+                "above {finest:.4} m/s, a 14th of the acceleration, and at most {coarsest} m/s, the larger one of \
+                 acceleration and noise"
+            );
+            return Err(OracleError::Lattice { field: "velocity", value: self.velocity, allowed });
+        }
+        Ok(())
     }
 }
 
-impl Lattice {
-    /// The lattice on which thresholds are searched.
-    fn coarse(self) -> Lattice {
-        Lattice { cell: 2.0 * self.cell, velocity: 1.5 * self.velocity }
-    }
+/// The largest distance of positions, a quarter of the shorter side.
+fn widest(config: &PointConfig) -> f64 {
+    config.arena[0].min(config.arena[1]) / 4.0
+}
+
+/// A positive number with two digits, for people.
+fn rounded(number: f64) -> f64 {
+    let unit = 10.0_f64.powf(number.log10().floor() - 1.0);
+    (number / unit).round() * unit
 }
 
 /// How much is computed for a certificate.
@@ -151,10 +192,11 @@ fn all_cores() -> usize {
     std::thread::available_parallelism().map_or(1, std::num::NonZeroUsize::get)
 }
 
-impl Default for Effort {
-    fn default() -> Self {
+impl Effort {
+    /// The effort by default, on the lattice of the world.
+    pub fn of(config: &PointConfig) -> Self {
         Effort {
-            lattice: Lattice::default(),
+            lattice: Lattice::of(config),
             episodes: 250_000,
             selection_episodes: 100_000,
             candidates: 2,
@@ -177,6 +219,18 @@ pub struct Baseline {
     pub lava_rate: f64,
     /// Share of episodes that reach the goal.
     pub goal_rate: f64,
+}
+
+impl Baseline {
+    fn new(name: String, law: &ReturnLaw, alpha: f64) -> Baseline {
+        Baseline {
+            name,
+            mean: law.mean(),
+            cvar: law.cvar(alpha),
+            lava_rate: law.probability(End::Lava),
+            goal_rate: law.probability(End::Goal),
+        }
+    }
 }
 
 /// A certificate. Its [`Display`] is a readable page.
@@ -210,10 +264,17 @@ pub struct Certified {
     pub timeout_rate: f64,
     /// Mean y in m at which episodes first pass the middle of the arena in x (x = 5 by default).
     pub crossing_y: Option<f64>,
-    /// Threshold w of the controller; `None` at eta = 1.
+    /// Who attains it: `lattice`, the controller of the programme, or the name of a script that is better.
+    pub controller: String,
+    /// Threshold w of the controller; `None` at eta = 1 and for a script.
     pub threshold: Option<f64>,
-    /// The programme's own, interpolated value: not certified.
+    /// The programme's own, interpolated value of the optimum: not certified. What more pushes would add to it
+    /// is taken from a coarse lattice.
     pub lattice_value: f64,
+    /// How far that may be from the truth: what it differs by on a lattice of twice the cell and 1.5 times the
+    /// distance of velocities, what more pushes add, rounding, and where noise is so small that returns are
+    /// a matter of whole steps, one step's cost.
+    pub lattice_error: f64,
     /// Resolution of the programme.
     pub lattice: Lattice,
     /// Nodes in x, y, v_x, v_y.
@@ -228,7 +289,7 @@ pub struct Certified {
     pub law: ReturnLaw,
 }
 
-/// The certificate of a world at the default effort, on a given lattice.
+/// The certificate of a world. `watch` is told how far it is.
 ///
 /// # Errors
 /// If an argument is out of range.
@@ -236,56 +297,73 @@ pub fn certify(
     config: &PointConfig,
     gamma: f64,
     eta: f64,
-    lattice: &Lattice,
-) -> Result<Certified, OracleError> {
-    certify_with(config, gamma, eta, &Effort { lattice: *lattice, ..Effort::default() })
-}
-
-/// The certificate of a world.
-///
-/// # Errors
-/// If an argument is out of range.
-pub fn certify_with(
-    config: &PointConfig,
-    gamma: f64,
-    eta: f64,
     effort: &Effort,
+    watch: &dyn Watch,
 ) -> Result<Certified, OracleError> {
     let began = Instant::now();
     let alpha = check(config, gamma, eta, effort)?;
-    let rewards = Rewards::new(config, gamma);
-    let threads = effort.threads.max(1);
-    let space = Space::new(config, &effort.lattice, threads);
-    let (chosen, threshold) = if alpha == 1.0 {
-        (Controller::new(space, &rewards, Utility::Return, threads), None)
-    } else {
-        let (controller, w) = choose(config, gamma, alpha, effort, &space, &rewards)?;
-        (controller, Some(w))
-    };
-    let Played { law, crossing_y, .. } =
-        play(config, gamma, &chosen, effort.episodes, CERTIFYING_SEED, threads)?;
-    let baselines = Scripted::all(config)
-        .iter()
-        .map(|scripted| {
-            let episodes = effort.baseline_episodes;
-            let law = play(config, gamma, scripted, episodes, CERTIFYING_SEED, threads)?.law;
-            Ok(Baseline {
-                name: scripted.name(),
-                mean: law.mean(),
-                cvar: law.cvar(alpha),
-                lava_rate: law.probability(End::Lava),
-                goal_rate: law.probability(End::Goal),
-            })
-        })
-        .collect::<Result<_, ConfigError>>()?;
+    let problem = Problem { config, gamma, alpha, effort, rewards: Rewards::new(config, gamma) };
+    let space = Space::new(config, &effort.lattice, problem.threads());
+    let coarse = Space::new(config, &effort.lattice.coarse(config), problem.threads());
+    let thresholds = problem.thresholds();
+    let mut steps = Steps::new(watch, problem.cost(&coarse, &space, thresholds.len()));
+
+    let ranked = rank(&thresholds, |threshold| {
+        let step = steps.next(sweep::cost(&coarse, SWEPT));
+        problem.value_on(&coarse, threshold, SWEPT, &step)
+    });
+    let (coarse_value, threshold) = ranked[0];
+    let step = steps.next(sweep::cost(&coarse, PLAYED));
+    let more_pushes = problem.value_on(&coarse, threshold, PLAYED, &step) - coarse_value;
+    drop(coarse);
+
+    let scripts = Scripted::all(config);
+    let mut baselines = Vec::new();
+    for scripted in &scripts {
+        let step = steps.next(problem.playing(effort.baseline_episodes));
+        let law = problem.play(scripted, effort.baseline_episodes, CERTIFYING_SEED, &step)?.law;
+        baselines.push(Baseline::new(scripted.name(), &law, alpha));
+    }
+
+    // The best script, then the controllers, one table at a time.
+    let script = (0..scripts.len())
+        .max_by(|&a, &b| baselines[a].cvar.total_cmp(&baselines[b].cvar))
+        .expect("there are scripts");
+    let mut best = problem.try_out(&scripts[script], &mut steps)?;
+    let mut chosen = (baselines[script].name.clone(), None);
+    let mut lattice_value = f64::NEG_INFINITY;
+    for &(_, threshold) in ranked.iter().take(effort.candidates.max(1)) {
+        let utility = threshold.map_or(Utility::Return, Utility::Shortfall);
+        let step = steps.next(sweep::cost(&space, SWEPT));
+        let controller =
+            Controller::new(space.clone(), &problem.rewards, utility, problem.threads(), &step);
+        lattice_value = lattice_value.max(problem.risk(threshold, controller.value()));
+        let tried = problem.try_out(&controller, &mut steps)?;
+        if tried.selection >= best.selection {
+            best = tried;
+            chosen = (CONTROLLER.to_owned(), threshold);
+        }
+    }
+
+    // A script whose few episodes say that it is better is heard in as many.
+    for (scripted, baseline) in scripts.iter().zip(&mut baselines) {
+        if baseline.cvar > best.played.law.cvar(alpha) {
+            let played = problem.play(scripted, effort.episodes, CERTIFYING_SEED, &())?;
+            *baseline = Baseline::new(scripted.name(), &played.law, alpha);
+            if baseline.cvar > best.played.law.cvar(alpha) {
+                best.played = played;
+                chosen = (scripted.name(), None);
+            }
+        }
+    }
+
+    let Tried { played: Played { law, crossing_y, .. }, .. } = best;
     let mean = Interval::new(law.mean(), law.mean_standard_error());
     let cvar = if alpha == 1.0 {
         mean
     } else {
         Interval::new(law.cvar(alpha), law.cvar_standard_error(alpha))
     };
-    let value = chosen.value();
-    let space = chosen.space();
     let speeds = 2 * space.halves.before + 1;
     Ok(Certified {
         env: NAME.to_owned(),
@@ -302,8 +380,13 @@ pub fn certify_with(
         goal_rate: law.probability(End::Goal),
         timeout_rate: law.probability(End::Timeout),
         crossing_y,
-        threshold,
-        lattice_value: threshold.map_or(value, |w| w + value / alpha),
+        controller: chosen.0,
+        threshold: chosen.1,
+        lattice_value: lattice_value + more_pushes,
+        lattice_error: (lattice_value - coarse_value).abs()
+            + more_pushes
+            + ROUNDING / alpha
+            + if space.is_coarse() { config.step_cost } else { 0.0 },
         lattice: effort.lattice,
         lattice_nodes: [space.axes[0].nodes, space.axes[1].nodes, speeds, speeds],
         episodes: effort.episodes,
@@ -311,6 +394,106 @@ pub fn certify_with(
         seconds: began.elapsed().as_secs_f64(),
         law,
     })
+}
+
+/// What is to be solved.
+struct Problem<'a> {
+    config: &'a PointConfig,
+    gamma: f64,
+    alpha: f64,
+    effort: &'a Effort,
+    rewards: Rewards,
+}
+
+/// A protagonist that was played.
+struct Tried {
+    /// Its CVaR_alpha over the episodes that choose.
+    selection: f64,
+    /// The episodes that certify.
+    played: Played,
+}
+
+impl Problem<'_> {
+    fn threads(&self) -> usize {
+        self.effort.threads.max(1)
+    }
+
+    /// The returns of all episodes that end, ascending, as thresholds; at alpha = 1 there is none.
+    fn thresholds(&self) -> Vec<Option<f64>> {
+        if self.alpha == 1.0 {
+            return vec![None];
+        }
+        let horizon = self.config.horizon as usize;
+        let ends = [self.config.goal_reward, self.config.lava_reward];
+        let mut all: Vec<f64> = (0..horizon)
+            .flat_map(|time| ends.map(|reward| self.rewards.ending(time, reward)))
+            .collect();
+        all.push(self.rewards.running[horizon]);
+        all.sort_by(f64::total_cmp);
+        all.dedup_by(|a, b| (*a - *b).abs() < 1e-12);
+        all.into_iter().map(Some).collect()
+    }
+
+    /// CVaR_alpha for an expected utility; the mean return without a threshold.
+    fn risk(&self, threshold: Option<f64>, value: f64) -> f64 {
+        threshold.map_or(value, |w| w + value / self.alpha)
+    }
+
+    /// What the programme gives a threshold on a lattice, by interpolation.
+    fn value_on(
+        &self,
+        space: &Space,
+        threshold: Option<f64>,
+        pushes: Rings,
+        watch: &dyn Watch,
+    ) -> f64 {
+        let utility = threshold.map_or(Utility::Return, Utility::Shortfall);
+        let swept = sweep(space, &self.rewards, utility, pushes, self.threads(), false, watch);
+        self.risk(threshold, swept.value)
+    }
+
+    fn play(
+        &self,
+        protagonist: &dyn Protagonist,
+        episodes: u64,
+        seed: u64,
+        watch: &dyn Watch,
+    ) -> Result<Played, ConfigError> {
+        play(self.config, self.gamma, protagonist, episodes, seed, self.threads(), watch)
+    }
+
+    /// Plays the episodes that choose, and those that certify.
+    fn try_out(
+        &self,
+        protagonist: &dyn Protagonist,
+        steps: &mut Steps<'_>,
+    ) -> Result<Tried, ConfigError> {
+        let Effort { selection_episodes, episodes, .. } = *self.effort;
+        let step = steps.next(self.playing(selection_episodes));
+        let law = self.play(protagonist, selection_episodes, SELECTION_SEED, &step)?.law;
+        let step = steps.next(self.playing(episodes));
+        let played = self.play(protagonist, episodes, CERTIFYING_SEED, &step)?;
+        Ok(Tried { selection: law.cvar(self.alpha), played })
+    }
+
+    /// Cost of playing, in the unit of [`sweep::cost`]: half an episode of a controller and of the engine.
+    fn playing(&self, episodes: u64) -> f64 {
+        let step = 1e4 + 5e2 * f64::from(self.config.substeps);
+        episodes as f64 * 0.5 * f64::from(self.config.horizon) * step
+    }
+
+    /// Cost of everything.
+    fn cost(&self, coarse: &Space, fine: &Space, thresholds: usize) -> f64 {
+        let Effort { candidates, selection_episodes, episodes, baseline_episodes, .. } =
+            *self.effort;
+        let candidates = candidates.clamp(1, thresholds) as f64;
+        let scripts = Scripted::all(self.config).len() as u64;
+        looks(thresholds) as f64 * sweep::cost(coarse, SWEPT)
+            + sweep::cost(coarse, PLAYED)
+            + candidates * sweep::cost(fine, SWEPT)
+            + (candidates + 1.0) * self.playing(selection_episodes + episodes)
+            + self.playing(scripts * baseline_episodes)
+    }
 }
 
 #[derive(Debug, Clone, Copy)]
@@ -333,19 +516,7 @@ fn check(config: &PointConfig, gamma: f64, eta: f64, effort: &Effort) -> Result<
     if !(gamma > 0.0 && gamma <= 1.0) {
         return Err(OracleError::Gamma(gamma));
     }
-    let Lattice { cell, velocity } = effort.lattice;
-    let widest = config.arena[0].min(config.arena[1]) / 4.0;
-    if !(cell > 0.0 && cell <= widest) {
-        let allowed = format!("above 0 and at most {widest} m, a quarter of the shorter side");
-        return Err(OracleError::Lattice { field: "cell", value: cell, allowed });
-    }
-    // The smoothing is accurate while the noise spans the cells of the velocity lattice; the window
-    // of a controller bounds the other end.
-    let finest = config.acceleration / 14.0;
-    if !(velocity > finest && velocity.is_finite()) {
-        let allowed = format!("above {finest} m/s, a 14th of the acceleration");
-        return Err(OracleError::Lattice { field: "velocity", value: velocity, allowed });
-    }
+    effort.lattice.check(config)?;
     for (field, episodes) in
         [("episodes", effort.episodes), ("selection_episodes", effort.selection_episodes)]
     {
@@ -354,79 +525,57 @@ fn check(config: &PointConfig, gamma: f64, eta: f64, effort: &Effort) -> Result<
             return Err(OracleError::Lattice { field, value: 0.0, allowed });
         }
     }
-    let tables = if alpha == 1.0 { 1 } else { effort.candidates.clamp(1, 2) };
-    let gibibytes = Space::bytes(config, &effort.lattice, tables) / f64::from(1 << 30);
+    let gibibytes = Space::bytes(config, &effort.lattice) / GIBIBYTE;
     if gibibytes > MOST_GIBIBYTES {
-        return Err(OracleError::TooLarge { gibibytes });
+        let Lattice { cell, velocity } = Lattice::of(config);
+        let fits = Space::bytes(config, &Lattice::of(config)) <= MOST_GIBIBYTES * GIBIBYTE;
+        let advice = if fits && effort.lattice != Lattice::of(config) {
+            format!("--cell {cell} --velocity {velocity} fits, and so does a shorter horizon")
+        } else {
+            "use a shorter horizon".to_owned()
+        };
+        return Err(OracleError::TooLarge { gibibytes, advice });
     }
     Ok(alpha)
 }
 
-/// The threshold and its controller.
-fn choose(
-    config: &PointConfig,
-    gamma: f64,
-    alpha: f64,
-    effort: &Effort,
-    space: &Space,
-    rewards: &Rewards,
-) -> Result<(Controller, f64), OracleError> {
-    let threads = effort.threads.max(1);
-    let thresholds = thresholds(config, rewards);
-    let coarse = Space::new(config, &effort.lattice.coarse(), threads);
-    let ranked = rank(&thresholds, |w| {
-        w + sweep(&coarse, rewards, Utility::Shortfall(w), threads, false).value / alpha
-    });
-    let mut best: Option<(f64, Controller, f64)> = None;
-    let candidates = ranked.iter().take(effort.candidates.max(1));
-    for &w in candidates {
-        // One table at a time besides the best one.
-        let controller = Controller::new(space.clone(), rewards, Utility::Shortfall(w), threads);
-        let law = if effort.candidates > 1 {
-            play(config, gamma, &controller, effort.selection_episodes, SELECTION_SEED, threads)?
-                .law
-                .cvar(alpha)
-        } else {
-            0.0
-        };
-        if best.as_ref().is_none_or(|(highest, ..)| law > *highest) {
-            best = Some((law, controller, w));
-        }
-    }
-    let (_, controller, w) = best.expect("there is at least one threshold");
-    Ok((controller, w))
+/// How many thresholds [`rank`] looks at first.
+const FIRST_LOOKS: usize = 12;
+
+/// The distance of the thresholds that [`rank`] looks at first, a power of two.
+fn first_stride(thresholds: usize) -> usize {
+    thresholds.div_ceil(FIRST_LOOKS).next_power_of_two()
 }
 
-/// Returns of episodes that reach the goal or the time limit, ascending.
-fn thresholds(config: &PointConfig, rewards: &Rewards) -> Vec<f64> {
-    let horizon = config.horizon as usize;
-    let mut all: Vec<f64> =
-        (0..horizon).map(|time| rewards.ending(time, config.goal_reward)).collect();
-    all.push(rewards.running[horizon]);
-    all.sort_by(f64::total_cmp);
-    all.dedup_by(|a, b| (*a - *b).abs() < 1e-12);
-    all
+/// How many thresholds [`rank`] looks at, at most.
+fn looks(thresholds: usize) -> usize {
+    let stride = first_stride(thresholds);
+    thresholds.div_ceil(stride) + 1 + 2 * stride.ilog2() as usize
 }
 
-/// Thresholds by their value, best first, as far as a section search on a function that rises and
-/// falls has looked at them; the neighbours of the best one are among them.
-fn rank(thresholds: &[f64], mut value: impl FnMut(f64) -> f64) -> Vec<f64> {
+/// The thresholds that were looked at, with their values, best first: some over the whole range, and then ever
+/// closer ones around the best.
+fn rank(
+    thresholds: &[Option<f64>],
+    mut value: impl FnMut(Option<f64>) -> f64,
+) -> Vec<(f64, Option<f64>)> {
+    let last = thresholds.len() - 1;
     let mut known: BTreeMap<usize, f64> = BTreeMap::new();
-    let mut at = |index: usize| *known.entry(index).or_insert_with(|| value(thresholds[index]));
-    let (mut low, mut high) = (0, thresholds.len() - 1);
-    while high - low > 3 {
-        let golden = 0.381_966;
-        let width = (high - low) as f64;
-        let left = low + (golden * width).round() as usize;
-        let right = (high - (golden * width).round() as usize).max(left + 1);
-        if at(left) < at(right) { low = left } else { high = right }
+    let mut look = |index: usize, known: &mut BTreeMap<usize, f64>| {
+        known.entry(index).or_insert_with(|| value(thresholds[index]));
+    };
+    let mut stride = first_stride(thresholds.len());
+    (0..last).step_by(stride).chain([last]).for_each(|index| look(index, &mut known));
+    while stride > 1 {
+        stride /= 2;
+        let (&best, _) = (known.iter().max_by(|a, b| a.1.total_cmp(b.1).then(b.0.cmp(a.0))))
+            .expect("the first look has values");
+        look(best.saturating_sub(stride), &mut known);
+        look((best + stride).min(last), &mut known);
     }
-    (low..=high).for_each(|index| {
-        at(index);
-    });
     let mut ranked: Vec<(f64, usize)> = known.into_iter().map(|(index, v)| (v, index)).collect();
     ranked.sort_by(|a, b| b.0.total_cmp(&a.0).then(a.1.cmp(&b.1)));
-    ranked.into_iter().map(|(_, index)| thresholds[index]).collect()
+    ranked.into_iter().map(|(value, index)| (value, thresholds[index])).collect()
 }
 
 /// The user's cache folder of certificates by the XDG specification; `None` for a user without a home.
@@ -444,6 +593,9 @@ struct Key<'a> {
     eta: f64,
     effort: &'a Effort,
 }
+
+/// Most bytes of a certificate on disk; that of the default world has a hundredth.
+const LARGEST_ENTRY: u64 = 1 << 26;
 
 /// A certificate on disk.
 #[derive(Serialize, Deserialize)]
@@ -464,51 +616,57 @@ pub fn shipped(config: &PointConfig, gamma: f64, eta: f64, effort: &Effort) -> O
     entries.into_iter().find(|entry| entry.key == key).map(|entry| entry.certified)
 }
 
-/// As [`certify_with`], but looks among the shipped certificates and into a folder first, and leaves
-/// a new certificate there. A file that does not fit is computed anew and replaced.
+/// As [`certify`], but looks among the shipped certificates and into a folder first, and leaves a new
+/// certificate there. A file that does not fit is computed anew and replaced.
 ///
 /// # Errors
-/// If an argument is out of range or the folder cannot be written.
+/// If an argument is out of range.
 pub fn certify_cached(
     config: &PointConfig,
     gamma: f64,
     eta: f64,
     effort: &Effort,
     folder: &Path,
+    watch: &dyn Watch,
 ) -> Result<Certified, OracleError> {
     if let Some(certified) = shipped(config, gamma, eta, effort) {
         return Ok(certified);
     }
     let key = key(config, gamma, eta, effort);
-    let found = std::fs::read(file_of(&key, folder)).ok();
+    let found = read_at_most(&file_of(&key, folder), LARGEST_ENTRY).ok();
     let found = found.and_then(|bytes| serde_json::from_slice::<Entry>(&bytes).ok());
     match found.filter(|entry| entry.key == key) {
         Some(entry) => Ok(entry.certified),
-        None => certify_anew(config, gamma, eta, effort, folder),
+        None => certify_anew(config, gamma, eta, effort, folder, watch),
     }
 }
 
-/// As [`certify_with`], and leaves the certificate in a folder for [`certify_cached`].
+/// As [`certify`], and leaves the certificate in a folder for [`certify_cached`]. Where that cannot be
+/// done `watch` is told why: the certificate is not lost.
 ///
 /// # Errors
-/// If an argument is out of range or the folder cannot be written.
+/// If an argument is out of range.
 pub fn certify_anew(
     config: &PointConfig,
     gamma: f64,
     eta: f64,
     effort: &Effort,
     folder: &Path,
+    watch: &dyn Watch,
 ) -> Result<Certified, OracleError> {
-    let certified = certify_with(config, gamma, eta, effort)?;
-    let failed = |path: &Path| {
-        let path = path.to_owned();
-        move |source| OracleError::Cache { path, source }
-    };
-    std::fs::create_dir_all(folder).map_err(failed(folder))?;
+    let certified = certify(config, gamma, eta, effort, watch)?;
     let entry = Entry { key: key(config, gamma, eta, effort), certified };
     let path = file_of(&entry.key, folder);
     let text = serde_json::to_string(&entry).expect("a certificate has a JSON form");
-    write_in_place(&path, text.as_bytes()).map_err(failed(&path))?;
+    let kept =
+        std::fs::create_dir_all(folder).and_then(|()| write_in_place(&path, text.as_bytes()));
+    if let Err(error) = kept {
+        watch.note(&format!(
+            "the answer is not kept for the next time: cannot write {}: {error}; set XDG_CACHE_HOME to a folder \
+             that can be written to",
+            path.display()
+        ));
+    }
     // Reading rounds the last bit of some numbers: all callers get the same ones, the first too.
     let Entry { certified, .. } = serde_json::from_str(&text).expect("its own form is read");
     Ok(certified)
@@ -528,6 +686,23 @@ fn fnv(bytes: &[u8]) -> u64 {
     bytes.iter().fold(0xcbf2_9ce4_8422_2325, |hash, &byte| {
         (hash ^ u64::from(byte)).wrapping_mul(0x0000_0100_0000_01b3)
     })
+}
+
+impl Certified {
+    /// Whether the two values of the optimum, the certified one and the lattice's own, contradict each other, in
+    /// words: then the controller may be far from optimal. What is certified holds nevertheless.
+    pub fn doubt(&self) -> Option<String> {
+        let half = (self.certified_cvar_hi - self.certified_cvar_lo) / 2.0;
+        let apart = (self.lattice_value - self.certified_cvar).abs();
+        let allowed = self.lattice_error + 1.5 * half; // three standard errors
+        (apart > allowed).then(|| {
+            format!(
+                "the lattice's own value is {apart:.4} from the certified one, more than both errors allow \
+                 ({allowed:.4}); the best may be far above what is certified, and a finer lattice may find it \
+                 (--cell, --velocity)"
+            )
+        })
+    }
 }
 
 impl Display for Certified {
@@ -563,11 +738,24 @@ impl Display for Certified {
             self.episodes
         )?;
         let [x, y, vx, vy] = self.lattice_nodes;
+        let Lattice { cell, velocity } = self.lattice;
         writeln!(
             f,
-            "Lattice {x} x {y} x {vx} x {vy}, {:.0} s; its own value, not certified, {:.4}.\n",
-            self.seconds, self.lattice_value
+            "Lattice {x} x {y} x {vx} x {vy} ({cell} m, {velocity} m/s), {:.0} s; its own value of the optimum, not \
+             certified, {:.4} +- {:.4}.",
+            self.seconds, self.lattice_value, self.lattice_error
         )?;
+        if let Some(doubt) = self.doubt() {
+            writeln!(f, "WARNING: {doubt}")?;
+        }
+        if self.controller != CONTROLLER {
+            writeln!(
+                f,
+                "The script `{}` does better than the lattice's controller.",
+                self.controller
+            )?;
+        }
+        writeln!(f)?;
         writeln!(f, "Scripted protagonists{:>9}{:>9}{:>10}{:>10}", "CVaR", "mean", "lava", "goal")?;
         for Baseline { name, mean, cvar, lava_rate, goal_rate } in &self.baselines {
             let (lava, goal) = (100.0 * lava_rate, 100.0 * goal_rate);

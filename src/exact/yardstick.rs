@@ -35,6 +35,7 @@ use super::optimum::Optimum;
 use super::oracle::{self, Certified, Effort, OracleError};
 use super::require_eta;
 use super::table::TablePolicy;
+use super::watch::Watch;
 use crate::game::returns::ReturnLaw;
 use lava_envs::{LavaGrid, LavaPoint, PointConfig, World};
 use serde::Serialize;
@@ -65,7 +66,7 @@ impl Solvable for LavaPoint {
         gamma: f64,
         options: &Options,
     ) -> Result<Option<Box<dyn Yardstick>>, YardstickError> {
-        let mut effort = Effort::default();
+        let mut effort = Effort::of(constants);
         effort.lattice.cell = options.cell.unwrap_or(effort.lattice.cell);
         effort.lattice.velocity = options.velocity.unwrap_or(effort.lattice.velocity);
         let constants = constants.clone();
@@ -167,11 +168,16 @@ impl<T: Display + Serialize> Answer for T {
 /// What is best in a world, and how far from it a policy is. Budgets eta are finite numbers of at
 /// least 1.
 pub trait Yardstick: Send + Sync {
-    /// All that is known of the optimum at a budget; `None` where nothing is.
+    /// All that is known of the optimum at a budget; `None` where nothing is. `watch` is told how far it is,
+    /// where that takes minutes.
     ///
     /// # Errors
     /// If the budget is out of range, or the optimum cannot be computed.
-    fn answer(&self, eta: f64) -> Result<Option<Box<dyn Answer>>, YardstickError>;
+    fn answer(
+        &self,
+        eta: f64,
+        watch: &dyn Watch,
+    ) -> Result<Option<Box<dyn Answer>>, YardstickError>;
 
     /// The law of the return of a policy that is optimal at a budget, for its mean and for its CVaR at
     /// any level; `None` where no such policy is known.
@@ -285,7 +291,7 @@ impl<W: World> Exact<W> {
 }
 
 impl<W: World> Yardstick for Exact<W> {
-    fn answer(&self, eta: f64) -> Result<Option<Box<dyn Answer>>, YardstickError> {
+    fn answer(&self, eta: f64, _: &dyn Watch) -> Result<Option<Box<dyn Answer>>, YardstickError> {
         Ok(Some(Box::new(self.world.solve(eta)?)))
     }
 
@@ -392,29 +398,33 @@ struct Oracle {
 }
 
 impl Oracle {
-    fn certified(&self, eta: f64) -> Result<Option<Certified>, OracleError> {
+    fn certified(&self, eta: f64, watch: &dyn Watch) -> Result<Option<Certified>, OracleError> {
         let Oracle { constants, gamma, effort, source } = self;
         let gamma = *gamma;
         Ok(match (source, oracle::cache_folder()) {
             (Source::Shipped, _) => oracle::shipped(constants, gamma, eta, effort),
-            (_, None) => Some(oracle::certify_with(constants, gamma, eta, effort)?),
+            (_, None) => Some(oracle::certify(constants, gamma, eta, effort, watch)?),
             (Source::Computed, Some(folder)) => {
-                Some(oracle::certify_cached(constants, gamma, eta, effort, &folder)?)
+                Some(oracle::certify_cached(constants, gamma, eta, effort, &folder, watch)?)
             }
             (Source::Anew, Some(folder)) => {
-                Some(oracle::certify_anew(constants, gamma, eta, effort, &folder)?)
+                Some(oracle::certify_anew(constants, gamma, eta, effort, &folder, watch)?)
             }
         })
     }
 }
 
 impl Yardstick for Oracle {
-    fn answer(&self, eta: f64) -> Result<Option<Box<dyn Answer>>, YardstickError> {
-        Ok(self.certified(eta)?.map(|certified| Box::new(certified) as Box<dyn Answer>))
+    fn answer(
+        &self,
+        eta: f64,
+        watch: &dyn Watch,
+    ) -> Result<Option<Box<dyn Answer>>, YardstickError> {
+        Ok(self.certified(eta, watch)?.map(|certified| Box::new(certified) as Box<dyn Answer>))
     }
 
     fn optimal_law(&self, eta: f64) -> Result<Option<ReturnLaw>, YardstickError> {
-        Ok(self.certified(eta)?.map(|certified| certified.law))
+        Ok(self.certified(eta, &())?.map(|certified| certified.law))
     }
 
     fn compare(
@@ -423,7 +433,7 @@ impl Yardstick for Oracle {
         evidence: &Evidence<'_>,
     ) -> Result<Option<Comparison>, YardstickError> {
         let alpha = require_eta(eta)?;
-        let (Some(oracle), Some(nominal)) = (self.certified(eta)?, evidence.nominal) else {
+        let (Some(oracle), Some(nominal)) = (self.certified(eta, &())?, evidence.nominal) else {
             return Ok(None);
         };
         let (cvar, error) = (nominal.cvar(alpha), nominal.cvar_standard_error(alpha));

@@ -11,6 +11,7 @@
 
 use super::artefacts::Manifest;
 use super::lock::RunLock;
+use super::words::{counted, thousands};
 use crate::files::{LARGEST_FILE, read_at_most};
 use std::collections::{BTreeMap, BTreeSet};
 use std::fmt;
@@ -132,7 +133,7 @@ impl Packed {
     /// Opens the archive of a results folder; `None` if there is no archive.
     fn open(dir: &Path) -> io::Result<Option<Packed>> {
         let path = dir.join(ARCHIVE);
-        let file = match File::open(&path) {
+        let file = match crate::files::open(&path) {
             Ok(file) => file,
             Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(None),
             Err(error) => return Err(error),
@@ -287,6 +288,11 @@ impl Store {
         Ok(Store { dir: dir.to_owned(), packed: Packed::open(dir)?.map(Arc::new) })
     }
 
+    /// A results folder whose archive is not looked at.
+    pub fn without_archive(dir: &Path) -> Store {
+        Store { dir: dir.to_owned(), packed: None }
+    }
+
     /// The path of its archive.
     pub fn archive(dir: &Path) -> PathBuf {
         dir.join(ARCHIVE)
@@ -396,7 +402,8 @@ pub struct Summary {
 impl fmt::Display for Summary {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let Summary { packed, runs, bytes, left } = self;
-        write!(f, "{packed} runs packed; the archive has {runs} runs and {bytes} bytes")?;
+        let [packed, runs] = [packed, runs].map(|&number| counted(number as u64, "run"));
+        write!(f, "{packed} packed; the archive has {runs} and {} bytes", thousands(*bytes))?;
         for folder in left {
             write!(f, "\nleft as it is: {}", folder.display())?;
         }

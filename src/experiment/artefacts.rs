@@ -18,6 +18,7 @@ use crate::exact::yardstick::Comparison;
 use crate::game::returns::ReturnLaw;
 use crate::learn::policy::Mode;
 use serde::{Deserialize, Serialize};
+use std::num::NonZeroUsize;
 
 /// Version of the on-disk formats. A folder with another one is refused and not overwritten.
 pub const SCHEMA: u32 = 1;
@@ -44,10 +45,16 @@ pub struct Manifest {
     pub device: String,
     /// Model name of the processor.
     pub cpu: String,
+    /// Number of its cores that the program may use; former versions did not write it.
+    #[serde(default)]
+    pub cores: Option<usize>,
     /// Wall-clock seconds of training.
     pub seconds: f64,
     /// Environment steps of training.
     pub steps: u64,
+    /// What was not done as it was asked for, such as a number of steps that was rounded up.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub notes: Vec<String>,
     /// Set when the run failed: the update, the player and the quantity.
     pub failure: Option<String>,
 }
@@ -63,8 +70,10 @@ impl Manifest {
             libtorch: cfg!(feature = "torch").then(|| "2.13.0".to_owned()),
             device: device.to_owned(),
             cpu: processor(),
+            cores: std::thread::available_parallelism().ok().map(NonZeroUsize::get),
             seconds,
             steps,
+            notes: Vec::new(),
             failure: None,
         }
     }

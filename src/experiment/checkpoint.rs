@@ -32,7 +32,7 @@ const KEPT: usize = 2;
 pub struct Checkpoint {
     /// [`super::artefacts::BUILD`] of its program: another one might end with other bits.
     pub program: String,
-    /// The run's `config.toml`.
+    /// [`super::config::RunConfig::training_text`] of the run.
     pub config: String,
     /// Seconds of training so far.
     pub seconds: f64,

@@ -21,7 +21,7 @@
 //! | how is the annotated default read | `annotated`, `rules` |
 //! | which layer wins | `layers` |
 //! | what are variants and axes | `variants` |
-//! | what does one run's `config.toml` hold | `run`, `constants` |
+//! | what does one run's `config.toml` hold, and how is it repeated | `run`, `constants`, `of_run` |
 
 mod annotated;
 pub mod catalogue;
@@ -29,6 +29,7 @@ mod conflicts;
 mod constants;
 mod keys;
 mod layers;
+mod of_run;
 mod renamed;
 mod rules;
 mod run;
@@ -186,6 +187,13 @@ pub struct EvaluationOptions {
     pub oracle: Oracle,
 }
 
+/// The most episodes of a play; the upper bound of `evaluation.episodes`.
+pub const MOST_EPISODES: u64 = 10_000_000;
+
+/// Memory that an episode takes while a run is evaluated: it is kept in three plays, and once more while
+/// they are sorted.
+pub const BYTES_OF_AN_EPISODE: f64 = 200.0;
+
 /// Where the certificate of lava-point's oracle comes from.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
@@ -328,7 +336,8 @@ impl Config {
         let base = files.iter().chain(&command).cloned().collect::<Vec<_>>();
         let base = Settings::of(catalogue, &base)?;
         if drafts.is_empty() {
-            base.check(catalogue, &experiment.envs, &experiment.methods, None)?;
+            let Experiment { envs, methods, etas, .. } = &experiment;
+            base.check(catalogue, (envs, methods, etas), None)?;
         }
         let mut variants = Vec::new();
         for draft in drafts {
@@ -341,7 +350,7 @@ impl Config {
             stack.extend(command.iter().cloned());
             let variants::Draft { name, envs, methods, etas, .. } = draft;
             let settings = Settings::of(catalogue, &stack)?;
-            settings.check(catalogue, &envs, &methods, Some(&name))?;
+            settings.check(catalogue, (&envs, &methods, &etas), Some(&name))?;
             variants.push(Variant { name, envs, methods, etas, settings });
         }
         Ok(Config { experiment, base, variants })
@@ -439,8 +448,7 @@ impl Settings {
     fn check(
         &self,
         catalogue: &Catalogue,
-        envs: &[WorldName],
-        methods: &[MethodName],
+        (envs, methods, etas): (&[WorldName], &[MethodName], &[Eta]),
         variant: Option<&VariantName>,
     ) -> Result<(), ConfigError> {
         for name in envs {
@@ -451,8 +459,9 @@ impl Settings {
             };
             for method in methods {
                 catalogue.method(method)?;
-                let method = (method, &self.methods[method]);
-                conflicts::check(catalogue, world, method, &self.worlds[name].train, &whose)?;
+                let (train, own) = (&self.worlds[name].train, &self.methods[method]);
+                conflicts::check(catalogue, world, (method, own), train, &whose)?;
+                conflicts::check_schedule(world, method, etas, train, &whose)?;
             }
         }
         Ok(())

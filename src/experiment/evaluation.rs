@@ -14,9 +14,11 @@ use super::config::RunConfig;
 use super::failure::RunError;
 use crate::exact::table::TablePolicy;
 use crate::exact::yardstick::{Evidence, Ratios, Solvable, Yardstick};
+use crate::game::returns::ReturnSoFar;
 use crate::learn::method::{Arena, Players};
 use crate::learn::play::{self, Played, Watcher};
 use crate::learn::policy::{Draw, Mode, Nominal, Opponent, Response, Situation, Streams};
+use crate::learn::vector_game::VectorGame;
 use lava_envs::law::sample_index;
 use lava_envs::{Law, World};
 
@@ -31,6 +33,8 @@ pub struct Contestants<'a, W: World> {
     pub constants: &'a W::Constants,
     /// The players.
     pub players: &'a dyn Players<W>,
+    /// Called at the end of every episode that is played.
+    pub progress: &'a dyn Fn(),
 }
 
 /// All plays of the protocol, the budget audit and the certificate.
@@ -75,11 +79,18 @@ pub fn plays<W: Arena + Solvable>(
     of: &Contestants<'_, W>,
     chance: Chance,
 ) -> Result<Vec<Play>, RunError> {
-    let modes: &[Mode] = match chance {
+    modes(chance)
+        .iter()
+        .map(|&mode| Ok(to_play(mode, chance, &of.play(mode, chance, &mut ())?)))
+        .collect()
+}
+
+/// The protagonists that [`plays`] plays.
+pub fn modes(chance: Chance) -> &'static [Mode] {
+    match chance {
         Chance::Exact => &[Mode::Greedy],
         Chance::Nominal | Chance::Antagonist => &[Mode::Greedy, Mode::Sampled],
-    };
-    modes.iter().map(|&mode| Ok(to_play(mode, chance, &of.play(mode, chance, &mut ())?))).collect()
+    }
 }
 
 impl<W: Arena + Solvable> Contestants<'_, W> {
@@ -101,6 +112,7 @@ impl<W: Arena + Solvable> Contestants<'_, W> {
         let (eta, gamma, seed) = (run.eta, run.gamma, run.evaluation.seed);
         let setting = play::Play { mode, draw, eta, gamma, episodes, seed };
         let mut protagonist = self.players.protagonist();
+        let watcher = &mut Watched { watcher, progress: self.progress };
         Ok(play::play(world, protagonist.as_mut(), opponent, &setting, watcher))
     }
 
@@ -188,6 +200,33 @@ impl<W: Arena + Solvable> Contestants<'_, W> {
         };
         let found = yardstick.compare(self.run.eta.get(), &evidence)?;
         Ok(found.map(Certificate::from))
+    }
+}
+
+/// A watcher, with a call at the end of each episode.
+struct Watched<'a, W: World> {
+    watcher: &'a mut dyn Watcher<W>,
+    progress: &'a dyn Fn(),
+}
+
+impl<W: World> Watcher<W> for Watched<'_, W> {
+    fn before(&mut self, world: &W, slot: usize) {
+        self.watcher.before(world, slot);
+    }
+
+    fn after(&mut self, game: &VectorGame<W>, slot: usize, episode: usize, so_far: &ReturnSoFar) {
+        self.watcher.after(game, slot, episode, so_far);
+        if game.steps[slot].end.is_some() {
+            (self.progress)();
+        }
+    }
+
+    fn has_enough(&self) -> bool {
+        self.watcher.has_enough()
+    }
+
+    fn keeps_episodes(&self) -> bool {
+        self.watcher.keeps_episodes()
     }
 }
 

@@ -1,6 +1,7 @@
 //! Files that grow while a run trains, with their length and checksum, so that a run that was cut
 //! short continues each of them exactly from the state of its checkpoint.
 
+use crate::files::{create, open_file};
 use serde::{Deserialize, Serialize};
 use std::fs::{File, OpenOptions};
 use std::io::{self, Read, Seek, SeekFrom, Write};
@@ -29,7 +30,7 @@ impl GrowingFile {
     /// # Errors
     /// If it cannot be written.
     pub fn create(path: &Path) -> io::Result<Self> {
-        Ok(GrowingFile { file: File::create(path)?, bytes: 0, crc: crc32fast::Hasher::new() })
+        Ok(GrowingFile { file: create(path)?, bytes: 0, crc: crc32fast::Hasher::new() })
     }
 
     /// Continues a file after `extent`; what follows is removed.
@@ -37,7 +38,7 @@ impl GrowingFile {
     /// # Errors
     /// If it cannot be read or written, or does not begin with that extent.
     pub fn resume(path: &Path, extent: Extent) -> io::Result<Self> {
-        let mut file = OpenOptions::new().read(true).write(true).open(path)?;
+        let mut file = open_file(path, OpenOptions::new().read(true).write(true))?;
         let mut head = Vec::new();
         (&mut file).take(extent.bytes).read_to_end(&mut head)?;
         let mut crc = crc32fast::Hasher::new();

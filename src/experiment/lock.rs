@@ -1,5 +1,6 @@
 //! The lock of a run's folder: one process at a time works on a run.
 
+use crate::files::open_file;
 use std::fs::{File, OpenOptions, TryLockError};
 use std::io;
 use std::path::Path;
@@ -18,7 +19,10 @@ impl RunLock {
     /// If the folder cannot be written or its file system has no locks.
     pub fn take(folder: &Path) -> io::Result<Option<RunLock>> {
         let path = folder.join(".lock");
-        let file = OpenOptions::new().create(true).truncate(false).write(true).open(path)?;
+        let options = &mut OpenOptions::new();
+        let file = open_file(&path, options.create(true).truncate(false).write(true)).map_err(
+            |error| io::Error::new(error.kind(), format!(".lock cannot be opened: {error}")),
+        )?;
         match file.try_lock() {
             Ok(()) => Ok(Some(RunLock { _file: file })),
             Err(TryLockError::WouldBlock) => Ok(None),

@@ -31,3 +31,4 @@ pub mod slurm;
 pub mod steps;
 pub mod stop;
 pub mod tensorboard;
+pub mod words;

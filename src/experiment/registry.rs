@@ -4,21 +4,25 @@
 //! with [`crate::registry!`] and hands them to [`crate::cli::main`]; see `examples/windy_corridor.rs`.
 
 use super::artefacts::{Chance, Play};
+use super::config::catalogue::MethodChecks;
 use super::config::{Catalogue, MethodInfo, RunConfig, WorldConstants, WorldInfo};
 use super::evaluation::{self, Contestants};
 use super::failure::RunError;
+use super::names::{RunId, WorldName};
 use super::run;
 use super::runner::Report;
 use super::steps::{self, Format};
 use super::stop::Stop;
-use crate::exact::yardstick::{Answer, Options, Solvable};
+use crate::exact::watch::Watch;
+use crate::exact::yardstick::{Answer, Options, Solvable, Source};
 use crate::files::{LARGEST_FILE, read_at_most};
 use crate::game::returns::ReturnLaw;
 use crate::learn::family::Perturbed;
 use crate::learn::method::{Arena, MethodEntry, Players};
 use crate::learn::policy::Mode;
+use crate::learn::weights;
 use lava_envs::{Scene, World};
-use std::io::Write;
+use std::io::{self, Write};
 use std::path::Path;
 use std::sync::LazyLock;
 
@@ -109,17 +113,19 @@ impl Registry {
 }
 
 /// What to play with a finished run.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Request {
+#[derive(Clone, Copy)]
+pub struct Request<'a> {
     /// Who decides the law of chance.
     pub chance: Chance,
     /// Episodes of each play, if not those of the run's configuration.
     pub episodes: Option<u64>,
     /// Seed of the streams, if not that of the run's configuration.
     pub seed: Option<u64>,
+    /// Called at the end of each episode.
+    pub progress: &'a dyn Fn(),
 }
 
-impl Request {
+impl Request<'_> {
     fn apply(&self, run: &RunConfig) -> RunConfig {
         let mut run = run.clone();
         run.evaluation.episodes = self.episodes.unwrap_or(run.evaluation.episodes);
@@ -162,7 +168,7 @@ pub trait Entry: Send + Sync {
         &self,
         run: &RunConfig,
         folder: &Path,
-        request: &Request,
+        request: &Request<'_>,
     ) -> Result<Vec<Play>, RunError>;
 
     /// Writes every step of episodes of the finished run in `folder`.
@@ -173,7 +179,7 @@ pub trait Entry: Send + Sync {
         &self,
         run: &RunConfig,
         folder: &Path,
-        request: &Request,
+        request: &Request<'_>,
         rows: (Mode, Format),
         output: &mut dyn Write,
     ) -> Result<(), RunError>;
@@ -188,6 +194,7 @@ pub trait Entry: Send + Sync {
         gamma: f64,
         eta: f64,
         options: &Options,
+        watch: &dyn Watch,
     ) -> Result<Box<dyn Answer>, RunError>;
 
     /// What figures draw of the world; `None` if the constants are not its own.
@@ -197,6 +204,31 @@ pub trait Entry: Send + Sync {
     /// solved exactly.
     fn frontier(&self, constants: &toml::Table, gamma: f64, etas: &[f64])
     -> Option<Vec<ReturnLaw>>;
+
+    /// The law of the return of the best policy that is known at a budget: exactly optimal, or of a
+    /// certificate that comes with the program. `None` if there is no such certificate.
+    ///
+    /// # Errors
+    /// If the world has no yardstick, or it cannot be computed for these constants.
+    fn optimum(
+        &self,
+        constants: &toml::Table,
+        gamma: f64,
+        eta: f64,
+    ) -> Result<Option<ReturnLaw>, RunError>;
+
+    /// What an episode can be: the least and the greatest return, discounted by gamma, and the time limit.
+    /// `None` if the constants are not the world's own, or it does not say.
+    fn limits(&self, constants: &toml::Table, gamma: f64) -> Option<Limits>;
+}
+
+/// What an episode of a world can be.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Limits {
+    /// The least and the greatest return.
+    pub returns: [f64; 2],
+    /// The most steps.
+    pub horizon: u32,
 }
 
 /// A world with its methods.
@@ -232,10 +264,31 @@ impl<W: Arena> WorldEntry<W> {
     fn load(&self, run: &RunConfig, folder: &Path) -> Result<Box<dyn Players<W>>, RunError> {
         let path = folder.join("final.safetensors");
         let bytes = read_at_most(&path, LARGEST_FILE).map_err(RunError::file(&path))?;
+        require_own(&weights::about(&bytes)?, &run.id()).map_err(RunError::file(&path))?;
         let mut players = (self.method(run)?.players)(&run.setting());
         players.load(&bytes)?;
         Ok(players)
     }
+}
+
+/// Refuses weights whose header names another run. Weights of other programs name none, and those of former
+/// versions neither method nor variant.
+fn require_own(about: &Option<String>, id: &RunId) -> io::Result<()> {
+    let words = about.as_deref().and_then(|about| about.split("run ").nth(1));
+    let Some(found) = words.and_then(|words| words.split(',').next()) else { return Ok(()) };
+    let former = found.split('/').count() == 3;
+    let same = |found: RunId| {
+        let place = |of: &RunId| (of.world.clone(), of.eta, of.seed);
+        found == *id || former && place(&found) == place(id)
+    };
+    if found.parse().is_ok_and(same) {
+        return Ok(());
+    }
+    let problem = format!(
+        "it holds the weights of the run {found}, but this is the folder of {id}; put the run's own \
+         weights back, or move the folder away and train it again"
+    );
+    Err(io::Error::new(io::ErrorKind::InvalidData, problem))
 }
 
 fn constants<W: World>(of: &WorldConstants) -> Result<W::Constants, RunError> {
@@ -248,7 +301,12 @@ impl<W: Arena + Solvable> Entry for WorldEntry<W> {
     }
 
     fn info(&self) -> WorldInfo {
-        WorldInfo::of::<W>(self.methods.iter().map(|of| (of.name, of.check)).collect())
+        let checks = |of: &MethodEntry<W>| MethodChecks {
+            method: of.name,
+            options: of.check,
+            schedule: of.check_schedule,
+        };
+        WorldInfo::of::<W>(self.methods.iter().map(checks).collect())
     }
 
     fn methods(&self) -> Vec<MethodInfo> {
@@ -275,11 +333,12 @@ impl<W: Arena + Solvable> Entry for WorldEntry<W> {
         &self,
         run: &RunConfig,
         folder: &Path,
-        request: &Request,
+        request: &Request<'_>,
     ) -> Result<Vec<Play>, RunError> {
         let (run, constants) = (request.apply(run), constants::<W>(&run.env)?);
         let players = self.load(&run, folder)?;
-        let contestants = Contestants { run: &run, constants: &constants, players: &*players };
+        let (run, constants, players) = (&run, &constants, &*players);
+        let contestants = Contestants { run, constants, players, progress: request.progress };
         evaluation::plays(&contestants, request.chance)
     }
 
@@ -287,7 +346,7 @@ impl<W: Arena + Solvable> Entry for WorldEntry<W> {
         &self,
         run: &RunConfig,
         folder: &Path,
-        request: &Request,
+        request: &Request<'_>,
         (mode, format): (Mode, Format),
         output: &mut dyn Write,
     ) -> Result<(), RunError> {
@@ -295,7 +354,8 @@ impl<W: Arena + Solvable> Entry for WorldEntry<W> {
         let slots = &mut run.evaluation.parallel_episodes;
         *slots = (*slots).min(steps::MOST_PARALLEL);
         let players = self.load(&run, folder)?;
-        let contestants = Contestants { run: &run, constants: &constants, players: &*players };
+        let (run, constants, players) = (&run, &constants, &*players);
+        let contestants = Contestants { run, constants, players, progress: request.progress };
         steps::write_rollout(&contestants, mode, request.chance, format, output)
     }
 
@@ -305,9 +365,10 @@ impl<W: Arena + Solvable> Entry for WorldEntry<W> {
         gamma: f64,
         eta: f64,
         options: &Options,
+        watch: &dyn Watch,
     ) -> Result<Box<dyn Answer>, RunError> {
         let yardstick = W::yardstick(&constants::<W>(of)?, gamma, options)?;
-        let answer = yardstick.map(|yardstick| yardstick.answer(eta)).transpose()?.flatten();
+        let answer = yardstick.map(|yardstick| yardstick.answer(eta, watch)).transpose()?.flatten();
         answer.ok_or_else(|| RunError::NoYardstick(W::NAME.to_owned()))
     }
 
@@ -327,5 +388,25 @@ impl<W: Arena + Solvable> Entry for WorldEntry<W> {
         yardstick.exact()?; // a curve of sampled laws would have their errors
         let law = |eta: &f64| yardstick.optimal_law(*eta).ok()?;
         Some(etas.iter().filter_map(law).collect())
+    }
+
+    fn optimum(
+        &self,
+        of: &toml::Table,
+        gamma: f64,
+        eta: f64,
+    ) -> Result<Option<ReturnLaw>, RunError> {
+        let constants = WorldConstants { world: WorldName::of::<W>(), table: of.clone() };
+        let constants = self::constants::<W>(&constants)?;
+        let options = Options { source: Source::Shipped, ..Options::default() };
+        let yardstick = W::yardstick(&constants, gamma, &options)?;
+        let yardstick = yardstick.ok_or_else(|| RunError::NoYardstick(W::NAME.to_owned()))?;
+        Ok(yardstick.optimal_law(eta)?)
+    }
+
+    fn limits(&self, constants: &toml::Table, gamma: f64) -> Option<Limits> {
+        let constants = constants.clone().try_into().ok()?;
+        let world = W::new(&constants, 1).ok()?;
+        Some(Limits { returns: world.return_range(gamma)?, horizon: world.horizon() })
     }
 }

@@ -1,21 +1,23 @@
 //! One run, from its configuration to its artefacts: train, keep the weights, evaluate.
 //!
 //! Training writes a checkpoint every few updates, on a request to stop, and at its end. A run
-//! that was cut short continues from the last valid one and ends with the same bits.
+//! that was cut short continues from the last valid one and ends with the same bits. Once the final weights
+//! are written, training is over: only the evaluation begins again.
 
 use super::artefacts::{BUILD, Evaluation, Manifest, SCHEMA};
 use super::checkpoint::{self, Checkpoint, CheckpointError};
-use super::config::RunConfig;
+use super::config::{EvaluationOptions, RunConfig};
 use super::evaluation::{self, Contestants};
 use super::failure::RunError;
 use super::figure_data;
 use super::lock::RunLock;
 use super::progress_file::ProgressFile;
-use super::runner::{Report, Tick, read_evaluation};
+use super::runner::{Evaluated, Report, Tick, WEIGHTS, evaluation_in};
 use super::stop::Stop;
 use crate::exact::yardstick::Solvable;
-use crate::files::{remove_parts, write_in_place};
-use crate::learn::method::{Arena, MethodEntry, Setting, Training};
+use crate::files::{LARGEST_FILE, read_at_most, read_text, remove_parts, write_in_place};
+use crate::learn::method::{Arena, MethodEntry, Players, Setting, Training};
+use std::cell::{Cell, RefCell};
 use std::fs;
 use std::io;
 use std::path::Path;
@@ -42,11 +44,16 @@ pub fn execute<W: Arena + Solvable>(
     tch::set_num_threads(1);
     let lock = RunLock::take(folder).map_err(RunError::file(folder))?;
     let Some(_lock) = lock else { return Err(RunError::Unfinished) };
-    if matches!(read_evaluation(folder), Ok(Some(_))) {
+    if matches!(evaluation_in(folder), Ok(Some(_))) {
         return Ok(()); // another process has finished it meanwhile
     }
     remove_parts(folder).map_err(RunError::file(folder))?;
     let setting = run.setting();
+    if let Some((players, manifest)) = trained_before(method, &setting, folder, report)? {
+        report(Report::Note("is trained; its weights are evaluated".to_owned()));
+        let contestants = Contestants { run, constants, players: &*players, progress: &|| () };
+        return evaluate(&contestants, (manifest.steps, manifest.seconds), folder, stop, report);
+    }
     let mut attempt = Attempt::begin(method, constants, run, &setting, folder, report)?;
     let trained = attempt.train(stop, report);
     if matches!(trained, Err(RunError::Unfinished | RunError::File { .. })) {
@@ -54,16 +61,81 @@ pub fn execute<W: Arena + Solvable>(
     }
     let (steps, seconds) = (attempt.training.steps(), attempt.seconds());
     let mut manifest = Manifest::of(&run.id(), &run.device.to_string(), steps, seconds);
+    manifest.notes.extend(run.train.rounding());
     manifest.failure = trained.as_ref().err().map(ToString::to_string);
     write_json(&folder.join("manifest.json"), &manifest)?;
     trained?;
 
     let players = attempt.training.players();
-    let path = folder.join("final.safetensors");
+    let path = folder.join(WEIGHTS);
     let about = format!("schema {SCHEMA}, run {}, steps {steps}", manifest.run);
     write_in_place(&path, &players.weights(about)?).map_err(RunError::file(&path))?;
 
-    let contestants = Contestants { run, constants, players };
+    let contestants = Contestants { run, constants, players, progress: &|| () };
+    evaluate(&contestants, (steps, seconds), folder, stop, report)
+}
+
+/// Players with the manifest of their run.
+type Trained<W> = (Box<dyn Players<W>>, Manifest);
+
+/// The players of a run whose training is over, with its manifest. Without both, or if one is damaged, it
+/// has to be trained.
+fn trained_before<W: Arena>(
+    method: &MethodEntry<W>,
+    setting: &Setting<'_>,
+    folder: &Path,
+    report: &mut dyn FnMut(Report),
+) -> Result<Option<Trained<W>>, RunError> {
+    let manifest = read_text(&folder.join("manifest.json")).ok();
+    let manifest: Option<Manifest> = manifest.and_then(|text| serde_json::from_str(&text).ok());
+    let path = folder.join(WEIGHTS);
+    let bytes = match read_at_most(&path, LARGEST_FILE) {
+        Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(None),
+        bytes => bytes,
+    };
+    let Some(manifest) = manifest.filter(|manifest| manifest.failure.is_none()) else {
+        return Ok(None);
+    };
+    let mut players = (method.players)(setting);
+    let loaded = match bytes {
+        Ok(bytes) => players.load(&bytes).map_err(|error| error.to_string()),
+        Err(error) => Err(error.to_string()),
+    };
+    if let Err(problem) = loaded {
+        let path = path.display();
+        report(Report::Note(format!(
+            "{path} cannot be used ({problem}); the run is trained again"
+        )));
+        return Ok(None);
+    }
+    Ok(Some((players, manifest)))
+}
+
+/// Evaluates the players of a run, trained for so many steps and seconds, and writes what is found.
+fn evaluate<W: Arena + Solvable>(
+    contestants: &Contestants<'_, W>,
+    (steps, seconds): (u64, f64),
+    folder: &Path,
+    stop: &Stop,
+    report: &mut dyn FnMut(Report),
+) -> Result<(), RunError> {
+    let run = contestants.run;
+    // Those of the protocol, and those from which figures are drawn.
+    let EvaluationOptions { episodes, figure_episodes, .. } = run.evaluation;
+    let of = match contestants.players.opponent() {
+        Some(_) => 4 * episodes + figure_episodes,
+        None => 2 * episodes,
+    };
+    let (played, told, report) = (Cell::new(0), Cell::new(0), RefCell::new(report));
+    let progress = || {
+        // At most a hundred times. A few episodes more are shown in figures.
+        let episodes: u64 = (played.get() + 1).min(of);
+        if played.replace(episodes) == 0 || (episodes - told.get()) * 100 >= of {
+            told.set(episodes);
+            (report.borrow_mut())(Report::Evaluated(Evaluated { episodes, of }));
+        }
+    };
+    let contestants = Contestants { progress: &progress, ..*contestants };
     let found = stop.interruptible(|| {
         Ok::<_, RunError>((
             evaluation::protocol(&contestants)?,
@@ -188,7 +260,7 @@ impl<'a, W: Arena + Solvable> Attempt<'a, W> {
         let path = self.folder.join(ProgressFile::NAME);
         let checkpoint = Checkpoint {
             program: BUILD.to_owned(),
-            config: self.run.to_toml(),
+            config: self.run.training_text(),
             seconds: self.seconds(),
             progress: self.progress.extent().map_err(RunError::file(&path))?,
             training: self.training.state(),
@@ -213,7 +285,7 @@ fn resume<W: Arena>(
 ) -> Result<Checkpoint, CheckpointError> {
     let unfit = |reason: &str| CheckpointError::Unfit(reason.to_owned());
     let checkpoint = checkpoint::load(path)?;
-    if checkpoint.config != run.to_toml() {
+    if checkpoint.config != run.training_text() {
         return Err(unfit("it is of another configuration"));
     }
     if checkpoint.program != BUILD {

@@ -14,7 +14,8 @@ mod worker;
 use super::archive::RunFiles;
 use super::artefacts::{Evaluation, Manifest, SCHEMA};
 use super::checkpoint;
-use super::config::{Catalogue, Config, ConfigError, RunConfig};
+use super::config::{Catalogue, Config, ConfigError, Difference, RunConfig};
+use super::figure_data;
 use super::lock::RunLock;
 use super::names::RunId;
 use crate::files::{read_text, write_in_place};
@@ -24,7 +25,8 @@ use std::fs;
 use std::io;
 use std::num::NonZeroUsize;
 use std::path::{Path, PathBuf};
-use std::sync::{Mutex, mpsc};
+use std::sync::Mutex;
+use std::sync::mpsc::{self, RecvTimeoutError};
 use std::time::{Duration, Instant};
 use thiserror::Error;
 
@@ -44,10 +46,21 @@ pub struct Tick {
 /// What a run tells while it is carried out.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Report {
-    /// How far it is.
+    /// How far its training is.
     Tick(Tick),
+    /// How far its evaluation is.
+    Evaluated(Evaluated),
     /// Something that its user should know.
     Note(String),
+}
+
+/// How far the evaluation of a run is.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Evaluated {
+    /// Episodes played so far.
+    pub episodes: u64,
+    /// Episodes in all.
+    pub of: u64,
 }
 
 /// JSON has no NaN; serde_json writes it as null.
@@ -77,6 +90,29 @@ pub enum RunnerError {
     /// A run's folder is of another version of the program.
     #[error(transparent)]
     Schema(ConfigError),
+    /// A run was evaluated with other settings and cannot be evaluated again.
+    #[error(
+        "{} holds a run that was evaluated with other settings ({told}), and its weights are gone: there \
+         is no final.safetensors to evaluate again; use its settings, put that file back, or choose \
+         another folder with --out",
+        folder.display()
+    )]
+    NoWeights {
+        /// The run's folder.
+        folder: PathBuf,
+        /// What differs.
+        told: String,
+    },
+    /// A run's `evaluation.json` cannot be read, but training may be kept.
+    #[error(
+        "{} {reason}; the `bench` or `train` that wrote it evaluates the run again", path.display()
+    )]
+    Damaged {
+        /// The file.
+        path: PathBuf,
+        /// What is wrong with it.
+        reason: String,
+    },
 }
 
 /// Why a run did not finish.
@@ -114,13 +150,22 @@ pub enum Event {
         run: RunId,
         /// Its environment steps in all.
         steps: u64,
+        /// Environment steps of an update.
+        update: u64,
     },
-    /// A run makes progress.
+    /// A run makes progress in training.
     Ticked {
         /// The run.
         run: RunId,
         /// How far it is.
         tick: Tick,
+    },
+    /// A run makes progress in its evaluation.
+    Evaluating {
+        /// The run.
+        run: RunId,
+        /// How far it is.
+        evaluated: Evaluated,
     },
     /// A run has something to say.
     Noted {
@@ -147,6 +192,8 @@ pub enum Event {
         /// Why.
         reason: String,
     },
+    /// Nothing else has happened for a second.
+    Quiet,
     /// A run was stopped.
     Stopped {
         /// The run.
@@ -192,7 +239,7 @@ pub fn prepare<'a>(
     let mut finished = Vec::new();
     for id in runs {
         let run = config.run(id);
-        if is_finished(catalogue, &run, &id.folder(out))? {
+        if matches!(look(catalogue, &run, &id.folder(out))?, Found::Finished) {
             tidy(&id.folder(out));
             finished.push(id.clone());
         } else {
@@ -204,6 +251,9 @@ pub fn prepare<'a>(
 
 /// How long to wait for a run that another process works on before looking again.
 const PAUSE: Duration = Duration::from_millis(250);
+
+/// How long nothing happens until [`Event::Quiet`].
+const QUIET: Duration = Duration::from_secs(1);
 
 /// Carries out the runs, `jobs` at a time, and tells `watch` what happens.
 pub fn sweep(
@@ -238,7 +288,12 @@ pub fn sweep(
             });
         }
         drop(events);
-        for event in incoming {
+        loop {
+            let event = match incoming.recv_timeout(QUIET) {
+                Ok(event) => event,
+                Err(RecvTimeoutError::Timeout) => Event::Quiet,
+                Err(RecvTimeoutError::Disconnected) => break,
+            };
             watch(&event);
             match event {
                 Event::Finished { .. } => outcome.finished += 1,
@@ -263,24 +318,32 @@ fn carry_out(
     let folder = id.folder(&prepared.out);
     let start = Instant::now();
     let mut steps = 0;
-    let result = match begin(prepared.catalogue, run, &folder) {
-        Ok(Begun::Free) => {
-            send(Event::Started { run: id.clone(), steps: run.train.steps });
-            launcher.launch(run, &folder, stop, &mut |report| {
+    let (result, evaluation) = match begin(prepared.catalogue, run, &folder) {
+        Ok(Begun::Free(note)) => {
+            let (all, update) = (run.train.whole_steps(), run.train.rollout());
+            send(Event::Started { run: id.clone(), steps: all, update });
+            if let Some(note) = note {
+                send(Event::Noted { run: id.clone(), note });
+            }
+            let result = launcher.launch(run, &folder, stop, &mut |report| {
                 send(match report {
                     Report::Tick(tick) => {
                         steps = tick.steps;
                         Event::Ticked { run: id.clone(), tick }
                     }
+                    Report::Evaluated(evaluated) => {
+                        Event::Evaluating { run: id.clone(), evaluated }
+                    }
                     Report::Note(note) => Event::Noted { run: id.clone(), note },
                 });
-            })
+            });
+            (result, evaluation_in(&folder))
         }
-        Ok(Begun::Finished) => Ok(()),
-        Ok(Begun::Busy) => Err(Failure::Unfinished),
-        Err(reason) => Err(Failure::Failed(reason)),
+        Ok(Begun::Finished) => (Ok(()), read_evaluation(&folder)),
+        Ok(Begun::Busy) => (Err(Failure::Unfinished), Ok(None)),
+        Err(reason) => (Err(Failure::Failed(reason)), Ok(None)),
     };
-    let result = match (result, read_evaluation(&folder)) {
+    let result = match (result, evaluation) {
         // However its process ended: it had nothing left to do.
         (_, Ok(Some(evaluation))) => Ok(evaluation),
         (Err(failure), _) => Err(failure),
@@ -310,12 +373,24 @@ fn require_writable(out: &Path) -> Result<(), RunnerError> {
         .map_err(|source| RunnerError::Output { folder: out.to_owned(), source })
 }
 
-/// Whether this run is finished, in its folder or in the archive of its results folder.
-fn is_finished(catalogue: &Catalogue, run: &RunConfig, folder: &Path) -> Result<bool, RunnerError> {
+/// What there is of a run.
+#[derive(Debug)]
+enum Found {
+    /// All of it.
+    Finished,
+    /// All of it, evaluated with other settings, as the text says; its weights are there.
+    Outdated(String),
+    /// Nothing, or a part to continue from; a text says what cannot be used.
+    Unfinished(Option<String>),
+}
+
+/// Looks for this run in its folder and in the archive of its results folder.
+fn look(catalogue: &Catalogue, run: &RunConfig, folder: &Path) -> Result<Found, RunnerError> {
     let foreign = |reason: String| RunnerError::Foreign { folder: folder.to_owned(), reason };
     let unreadable = |error| foreign(format!("cannot be read ({error})"));
     let files = RunFiles::at(folder).map_err(unreadable)?;
     let packed = files.filter(RunFiles::is_packed);
+    let is_packed = packed.is_some();
     let is_empty = match fs::read_dir(folder) {
         // Hidden files are a lock, and what is left of a file that was being written.
         Ok(entries) => entries
@@ -330,7 +405,7 @@ fn is_finished(catalogue: &Catalogue, run: &RunConfig, folder: &Path) -> Result<
             Some(text) => RunConfig::parse(&path, &text, catalogue),
             None => return Err(foreign(format!("is packed without {}", path.display()))),
         },
-        None if is_empty => return Ok(false),
+        None if is_empty => return Ok(Found::Unfinished(None)),
         None if !path.exists() => return Err(foreign("holds files but no config.toml".into())),
         None => RunConfig::load(&path, catalogue),
     };
@@ -346,20 +421,50 @@ fn is_finished(catalogue: &Catalogue, run: &RunConfig, folder: &Path) -> Result<
     // A run of a former version does not say its variant; its folder does.
     let variant = there.variant.take().or_else(|| run.variant.clone());
     let there = RunConfig { variant, ..there };
-    let differences = run.differences(&there);
-    if !differences.is_empty() {
-        let mut told: Vec<String> = differences
-            .iter()
-            .take(3)
-            .map(|of| format!("{} is {} there and {} here", of.key, of.theirs, of.ours))
-            .collect();
-        if differences.len() > told.len() {
-            told.push(format!("{} more", differences.len() - told.len()));
-        }
-        let told = told.join(", ");
+    let (evaluation, training): (Vec<Difference>, Vec<Difference>) =
+        run.differences(&there).into_iter().partition(|of| of.key.starts_with("evaluation."));
+    if !training.is_empty() {
+        let told = in_words(&training);
         return Err(foreign(format!("holds a run with another configuration ({told})")));
     }
-    read_evaluation(folder).map(|evaluation| evaluation.is_some())
+    match read_evaluation(folder) {
+        Ok(None) => return Ok(Found::Unfinished(None)),
+        Ok(Some(_)) => {}
+        Err(error @ RunnerError::Damaged { .. }) if !is_packed => {
+            return Ok(Found::Unfinished(Some(error.to_string())));
+        }
+        Err(error) => return Err(error),
+    }
+    if evaluation.is_empty() {
+        return Ok(Found::Finished);
+    }
+    let told = in_words(&evaluation);
+    let has_weights = match packed_files(folder).map_err(unreadable)? {
+        Some(packed) => packed.read(WEIGHTS).map_err(unreadable)?.is_some(),
+        None => false,
+    };
+    if has_weights || folder.join(WEIGHTS).is_file() {
+        return Ok(Found::Outdated(told));
+    }
+    Err(RunnerError::NoWeights { folder: folder.to_owned(), told })
+}
+
+/// The files of a run that is in the archive of its results folder.
+fn packed_files(folder: &Path) -> io::Result<Option<RunFiles>> {
+    RunFiles::at(folder).map(|files| files.filter(RunFiles::is_packed))
+}
+
+/// The first differences of two configurations.
+fn in_words(differences: &[Difference]) -> String {
+    let mut told: Vec<String> = differences
+        .iter()
+        .take(3)
+        .map(|of| format!("{} is {} there and {} here", of.key, of.theirs, of.ours))
+        .collect();
+    if differences.len() > told.len() {
+        told.push(format!("{} more", differences.len() - told.len()));
+    }
+    told.join(", ")
 }
 
 /// The evaluation of a run, from its folder or from the archive of its results folder; `None` if there is
@@ -368,32 +473,51 @@ fn is_finished(catalogue: &Catalogue, run: &RunConfig, folder: &Path) -> Result<
 /// # Errors
 /// If it is damaged or of another schema version.
 pub fn read_evaluation(folder: &Path) -> Result<Option<Evaluation>, RunnerError> {
-    let foreign = |reason: String| RunnerError::Foreign { folder: folder.to_owned(), reason };
-    let path = folder.join("evaluation.json");
-    let text = match RunFiles::at(folder) {
-        Ok(Some(files)) => files.text("evaluation.json"),
-        // A folder of another name has no archive above it.
-        Ok(None) => path.exists().then(|| read_text(&path)).transpose(),
-        Err(error) => Err(error),
+    let unreadable = |error: io::Error| RunnerError::Foreign {
+        folder: folder.to_owned(),
+        reason: format!("cannot be read ({error})"),
     };
-    let text =
-        text.map_err(|error| foreign(format!("has an unreadable evaluation.json ({error})")));
-    let Some(text) = text? else { return Ok(None) };
-    let damaged = |error| foreign(format!("has a damaged evaluation.json ({error})"));
-    let value: serde_json::Value = serde_json::from_str(&text).map_err(damaged)?;
-    if value["schema"] != SCHEMA {
-        let found = &value["schema"];
-        return Err(foreign(format!(
-            "has an evaluation.json of schema version {found}, this program reads {SCHEMA}"
-        )));
+    match packed_files(folder).map_err(unreadable)? {
+        Some(packed) => evaluation(folder, &packed.place(RESULT), packed.text(RESULT)),
+        None => evaluation_in(folder),
     }
-    serde_json::from_value(value).map(Some).map_err(damaged)
+}
+
+/// The evaluation in the folder of a run; `None` if there is none yet.
+///
+/// # Errors
+/// As [`read_evaluation`].
+pub fn evaluation_in(folder: &Path) -> Result<Option<Evaluation>, RunnerError> {
+    let path = folder.join(RESULT);
+    // A dangling link is a file that cannot be read, not an absent one.
+    let there = path.symlink_metadata().is_ok();
+    evaluation(folder, &path, there.then(|| read_text(&path)).transpose())
+}
+
+/// The evaluation of a text, which was read from `path` for the run of `folder`.
+fn evaluation(
+    folder: &Path,
+    path: &Path,
+    text: io::Result<Option<String>>,
+) -> Result<Option<Evaluation>, RunnerError> {
+    let damaged = |reason| RunnerError::Damaged { path: path.to_owned(), reason };
+    let text = text.map_err(|error| damaged(format!("cannot be read ({error})")))?;
+    let Some(text) = text else { return Ok(None) };
+    let no_json = |error| damaged(format!("is damaged ({error})"));
+    let value: serde_json::Value = serde_json::from_str(&text).map_err(no_json)?;
+    if let Some(found) = value.get("schema").filter(|found| **found != SCHEMA) {
+        let reason = format!(
+            "has an evaluation.json of schema version {found}, this program reads {SCHEMA}"
+        );
+        return Err(RunnerError::Foreign { folder: folder.to_owned(), reason });
+    }
+    serde_json::from_value(value).map(Some).map_err(no_json)
 }
 
 /// How a run's folder is found when its turn comes.
 enum Begun {
-    /// To be carried out.
-    Free,
+    /// To be carried out; a text says what its user should know.
+    Free(Option<String>),
     /// Another process works on it.
     Busy,
     /// Another process has finished it meanwhile.
@@ -406,12 +530,40 @@ fn begin(catalogue: &Catalogue, run: &RunConfig, folder: &Path) -> Result<Begun,
     fs::create_dir_all(folder).map_err(refused)?;
     let Some(_lock) = RunLock::take(folder).map_err(refused)? else { return Ok(Begun::Busy) };
     // Looked at again: another sweep may have been here since `prepare`.
-    if is_finished(catalogue, run, folder).map_err(|error| error.to_string())? {
-        return Ok(Begun::Finished);
-    }
+    let note = match look(catalogue, run, folder).map_err(|error| error.to_string())? {
+        Found::Finished => return Ok(Begun::Finished),
+        Found::Outdated(told) => {
+            discard_evaluation(folder).map_err(refused)?;
+            Some(format!("is evaluated again, without training: {told}"))
+        }
+        Found::Unfinished(note) => note,
+    };
     write_in_place(&folder.join("config.toml"), run.to_toml().as_bytes()).map_err(refused)?;
-    Ok(Begun::Free)
+    Ok(Begun::Free(note))
 }
+
+/// Makes an unfinished run of a finished one, whose weights are kept. The evaluation goes first: as long as
+/// there is one, it belongs to the `config.toml` beside it.
+fn discard_evaluation(folder: &Path) -> io::Result<()> {
+    if let Some(packed) = packed_files(folder)? {
+        // All that a finished run has beside its configuration and its evaluation.
+        for file in [WEIGHTS, "manifest.json", "progress.csv", figure_data::FILE] {
+            if let Some(bytes) = packed.read(file)? {
+                write_in_place(&folder.join(file), &bytes)?;
+            }
+        }
+    }
+    match fs::remove_file(folder.join(RESULT)) {
+        Err(error) if error.kind() != io::ErrorKind::NotFound => Err(error),
+        _ => Ok(()),
+    }
+}
+
+/// What the evaluation of a run found; the last file that it writes.
+const RESULT: &str = "evaluation.json";
+
+/// The weights of the players of a run.
+pub const WEIGHTS: &str = "final.safetensors";
 
 /// What a worker printed on standard error; empty logs are removed.
 const LOG: &str = "worker.log";

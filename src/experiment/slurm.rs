@@ -141,7 +141,7 @@ fn submission(
 }
 
 /// A text as one word of the shell.
-fn quoted(word: &str) -> String {
+pub fn quoted(word: &str) -> String {
     let quoter = shlex::Quoter::new().allow_nul(true);
     quoter.quote(word).expect("only NUL can be refused").into_owned()
 }

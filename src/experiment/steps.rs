@@ -11,6 +11,7 @@
 //! | `reward` | r_t | the same |
 //! | `clearance` | distance to lava after the step, in cells | in m |
 //! | `end` | goal, lava, timeout, or empty | the same |
+//! | state after the step | `next_x`, `next_y` | `next_x`, `next_y`, `next_vx`, `next_vy` |
 
 use super::artefacts::Chance;
 use super::evaluation::Contestants;
@@ -23,6 +24,7 @@ use crate::learn::policy::Mode;
 use crate::learn::vector_game::VectorGame;
 use lava_envs::{End, Field, World};
 use serde::ser::{Serialize, SerializeMap, Serializer};
+use std::borrow::Cow;
 use std::collections::BTreeMap;
 use std::io::{self, Write};
 
@@ -63,7 +65,7 @@ pub fn write_rollout<W: Arena + Solvable>(
 
 /// One step: names and fields in the order of the columns.
 #[derive(Debug)]
-struct Row(Vec<(&'static str, Field)>);
+struct Row(Vec<(Cow<'static, str>, Field)>);
 
 impl Serialize for Row {
     fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
@@ -103,7 +105,7 @@ impl<W: World> Watcher<W> for Rows<'_> {
             })
         });
         let clearance = game.world.clearance(slot);
-        let mut row =
+        let mut row: Vec<(&'static str, Field)> =
             vec![("episode", Field::Count(episode as u64)), ("t", Field::Count(rows.len() as u64))];
         row.append(&mut self.states[slot]);
         row.extend(W::action_columns(game.actions[slot]));
@@ -119,6 +121,9 @@ impl<W: World> Watcher<W> for Rows<'_> {
             ),
             ("end", end),
         ]);
+        let mut row: Vec<_> = row.into_iter().map(|(name, cell)| (name.into(), cell)).collect();
+        let next = game.world.state_columns(slot).into_iter();
+        row.extend(next.map(|(name, cell)| (format!("next_{name}").into(), cell)));
         rows.push(Row(row));
         *ended = step.end.is_some();
         while let Some(first) = self.waiting.first_entry()
@@ -138,6 +143,11 @@ impl<W: World> Watcher<W> for Rows<'_> {
     fn has_enough(&self) -> bool {
         self.failure.is_some()
     }
+
+    /// They are in the rows.
+    fn keeps_episodes(&self) -> bool {
+        false
+    }
 }
 
 struct Writer<'a> {
@@ -156,7 +166,7 @@ impl Writer<'_> {
             Format::Csv => {
                 let mut csv = csv::Writer::from_writer(&mut *self.output);
                 if !self.begun {
-                    csv.write_record(row.0.iter().map(|(name, _)| name))?;
+                    csv.write_record(row.0.iter().map(|(name, _)| name.as_ref()))?;
                     self.begun = true;
                 }
                 csv.serialize(row.0.iter().map(|(_, cell)| cell).collect::<Vec<_>>())?;

@@ -33,6 +33,12 @@ impl Stop {
     /// # Errors
     /// If the system refuses the handler.
     pub fn on_signals() -> io::Result<Stop> {
+        Self::listening().map_err(|error| {
+            io::Error::new(error.kind(), format!("cannot listen to signals: {error}"))
+        })
+    }
+
+    fn listening() -> io::Result<Stop> {
         let stop = Stop::default();
         for signal in [SIGINT, SIGTERM] {
             let code = i32::from(exit_code(signal));

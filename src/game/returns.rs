@@ -11,6 +11,9 @@
 use lava_envs::End;
 use serde::{Deserialize, Serialize};
 
+/// Half-width of a 95 % interval in standard errors: the standard normal quantile at 0.975.
+pub const NORMAL_95: f64 = 1.959_963_984_540_054;
+
 /// One value of the return, with how the episode came to it.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Atom {

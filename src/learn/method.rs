@@ -103,6 +103,15 @@ pub trait Method: Send + Sync + 'static {
         Ok(())
     }
 
+    /// Checks that a run at this budget trains the protagonist at all.
+    ///
+    /// # Errors
+    /// If it does not; the error says in one line what would.
+    fn check_schedule(options: &TrainOptions, eta: Eta) -> Result<(), String> {
+        let _ = (options, eta);
+        Ok(())
+    }
+
     /// Begins training on `world`, whose slots are the parallel episodes.
     fn begin<'a, W: Arena>(world: W, setting: &'a Setting<'a>) -> Box<dyn Training<W> + 'a>;
 
@@ -168,6 +177,8 @@ pub struct MethodEntry<W: Arena> {
     pub metrics: &'static [Metric],
     /// [`Method::check`].
     pub check: fn(&TrainOptions, &toml::Table) -> Result<(), String>,
+    /// [`Method::check_schedule`].
+    pub check_schedule: fn(&TrainOptions, Eta) -> Result<(), String>,
     /// [`Method::begin`].
     pub begin: for<'a> fn(W, &'a Setting<'a>) -> Box<dyn Training<W> + 'a>,
     /// [`Method::players`].
@@ -182,6 +193,7 @@ impl<W: Arena> MethodEntry<W> {
             defaults: M::DEFAULTS,
             metrics: M::METRICS,
             check: M::check::<W>,
+            check_schedule: M::check_schedule,
             begin: M::begin::<W>,
             players: M::players::<W>,
         }

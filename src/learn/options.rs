@@ -5,6 +5,9 @@
 
 use serde::{Deserialize, Serialize};
 
+/// The most updates of a run.
+pub const MOST_UPDATES: u64 = 10_000_000;
+
 /// How the two players are trained against each other (Algorithm 1).
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -49,6 +52,27 @@ impl TrainOptions {
     /// Environment steps of one rollout.
     pub fn rollout(&self) -> u64 {
         (self.parallel_episodes * self.rollout_steps) as u64
+    }
+
+    /// Updates of a run: as many as `steps` need, the last of which may exceed them.
+    pub fn updates(&self) -> u64 {
+        self.steps.div_ceil(self.rollout())
+    }
+
+    /// Environment steps of a run: whole updates.
+    pub fn whole_steps(&self) -> u64 {
+        self.updates().saturating_mul(self.rollout())
+    }
+
+    /// What to say where [`TrainOptions::whole_steps`] are not those that were asked for.
+    pub fn rounding(&self) -> Option<String> {
+        let (asked, made, update) = (self.steps, self.whole_steps(), self.rollout());
+        (asked != made).then(|| {
+            format!(
+                "train.steps = {asked} is rounded up to {made}: an update takes {update} steps \
+                 (train.parallel_episodes * train.rollout_steps)"
+            )
+        })
     }
 }
 

@@ -42,7 +42,7 @@ pub struct Episode {
 /// What was played.
 #[derive(Debug, Clone)]
 pub struct Played {
-    /// All episodes, by index.
+    /// All episodes, by index; none if the watcher does not keep them.
     pub episodes: Vec<Episode>,
     /// max |`E_P[delta_t]` - 1| over all steps.
     pub normalisation_error: f64,
@@ -75,6 +75,12 @@ pub trait Watcher<W: World> {
     /// Whether the remaining episodes need not be played.
     fn has_enough(&self) -> bool {
         false
+    }
+
+    /// Whether the episodes are returned as well. Where the watcher is all that counts, any number of them
+    /// needs no memory.
+    fn keeps_episodes(&self) -> bool {
+        true
     }
 }
 
@@ -117,12 +123,14 @@ pub fn play<W: World>(
 ) -> Played {
     let slots = world.episodes();
     let mut game = VectorGame::new(world, (0..slots as u64).map(|i| play.streams(i)).collect());
-    let mut played = vec![Running::start(0).ended(End::Timeout); play.episodes as usize];
+    let episodes = play.episodes as usize;
+    let kept = if watcher.keeps_episodes() { episodes } else { 0 };
+    let mut played = vec![Running::start(0).ended(End::Timeout); kept];
     let mut running: Vec<Running> = (0..slots).map(Running::start).collect();
     let mut next = slots;
     for (slot, episode) in running.iter().enumerate() {
         game.start(slot, play.eta);
-        game.idle[slot] = episode.index >= played.len();
+        game.idle[slot] = episode.index >= episodes;
     }
     while game.idle.iter().any(|idle| !idle) && !watcher.has_enough() {
         for slot in (0..slots).filter(|&slot| !game.idle[slot]) {
@@ -139,10 +147,12 @@ pub fn play<W: World>(
             episode.likelihood_ratio *= game.ratios[slot];
             watcher.after(&game, slot, episode.index, &episode.so_far);
             if let Some(end) = step.end {
-                played[episode.index] = episode.ended(end);
+                if let Some(place) = played.get_mut(episode.index) {
+                    *place = episode.ended(end);
+                }
                 *episode = Running::start(next);
                 next += 1;
-                if episode.index < played.len() {
+                if episode.index < episodes {
                     game.start(slot, play.eta);
                     game.streams[slot] = play.streams(episode.index as u64);
                 } else {

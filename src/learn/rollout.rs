@@ -205,6 +205,11 @@ impl<W: Arena> Collector<W> {
         self.finished.iter().map(|e| e.undiscounted).sum::<f64>() / self.finished.len() as f64
     }
 
+    /// Mean length in steps of the episodes that ended in the last rollout; NaN if none did.
+    pub fn mean_length(&self) -> f64 {
+        self.finished.iter().map(|e| f64::from(e.steps)).sum::<f64>() / self.finished.len() as f64
+    }
+
     /// Share of the finished episodes with this end.
     pub fn share(&self, end: End) -> f64 {
         let count = self.finished.iter().filter(|e| e.end == end).count();

@@ -16,6 +16,9 @@ use super::options::Role;
 use safetensors::tensor::{Dtype, SafeTensorError, SafeTensors, TensorView};
 use std::collections::{BTreeMap, HashMap};
 
+/// The entry of the header that says which run a file is of.
+const ABOUT: &str = "cvar-game";
+
 /// Why a file holds no weights of the pair.
 #[derive(Debug, thiserror::Error)]
 pub enum WeightsError {
@@ -62,8 +65,17 @@ pub fn to_bytes(networks: &[(Role, &Network)], about: String) -> Result<Vec<u8>,
         })
         .collect::<Result<Vec<_>, _>>()?;
     // One entry: the header of several would follow the random order of a hash map.
-    let metadata = HashMap::from([("cvar-game".to_owned(), about)]);
+    let metadata = HashMap::from([(ABOUT.to_owned(), about)]);
     Ok(safetensors::serialize(views, Some(metadata))?)
+}
+
+/// What [`to_bytes`] was told about a file; `None` if the file does not say.
+///
+/// # Errors
+/// If it is no safetensors file.
+pub fn about(bytes: &[u8]) -> Result<Option<String>, WeightsError> {
+    let (_, header) = SafeTensors::read_metadata(bytes)?;
+    Ok(header.metadata().as_ref().and_then(|of| of.get(ABOUT).cloned()))
 }
 
 /// A safetensors file of weights.

@@ -1,6 +1,6 @@
 //! Runs of one world and eta, measured and bootstrapped: what the tables are computed from.
 
-use super::runs::{Run, Runs};
+use super::runs::{Regret, Run, Runs};
 use super::statistics::{self, Estimate};
 use crate::experiment::archive::FIRST_METHOD;
 use crate::experiment::artefacts::Chance;
@@ -79,7 +79,7 @@ impl Measures {
         let laws = Laws::of(run, ReturnLaw::clone);
         let certificate = run.evaluation.as_ref().and_then(|evaluation| evaluation.certificate);
         let gap = certificate.map(|certificate| certificate.antagonist_gap);
-        let regret = certificate.map(|certificate| certificate.regret);
+        let regret = run.regret.known().map(|(regret, _)| regret);
         let cvar = statistics::cvar;
         Measures::new(run, &laws, alphas, regret, gap, cvar)
     }
@@ -94,7 +94,14 @@ impl Measures {
             number + noise * standard_error
         };
         let gap = certificate.map(|of| noisy(of.antagonist_gap, of.antagonist_gap_standard_error));
-        let regret = certificate.map(|of| noisy(of.regret, of.regret_standard_error));
+        let regret = match run.regret {
+            // The redrawn episodes have it.
+            Regret::Known { best: Some(best), .. } => {
+                laws.greedy.as_ref().map(|law| best - law.cvar(run.alpha()))
+            }
+            Regret::Known { value, standard_error, .. } => Some(noisy(value, standard_error)),
+            _ => None,
+        };
         let mut measures =
             Measures::new(run, &laws, alphas, regret, gap, |law, alpha| Some(law.cvar(alpha)));
         // A redrawn law counts no episodes; what the original refuses stays refused.
@@ -141,7 +148,7 @@ impl Measures {
 /// All seeds of one world and eta, of one method and variant.
 pub struct Group<'a> {
     /// What its rows and panels are called: `METHOD[/VARIANT]`, or only `VARIANT` in a folder where all runs are
-    /// of the method `game`; `None` where none has a variant either.
+    /// of the method `game`, and what tells its settings apart; `None` where all this is the same.
     pub method: Option<String>,
     /// Name of the world.
     pub env: &'a str,
@@ -161,12 +168,18 @@ pub struct Group<'a> {
 /// The runs, measured and bootstrapped, by method and variant, world and eta.
 pub fn groups(runs: &Runs) -> Vec<Group<'_>> {
     let one_method = runs.runs.iter().all(|run| run.name.method == FIRST_METHOD);
-    let method = |run: &Run| match &run.name.variant {
-        _ if runs.are_plain() => None,
-        Some(variant) if one_method => Some(variant.clone()),
-        _ => Some(run.name.label()),
+    let method = |run: &Run| {
+        let name = match &run.name.variant {
+            _ if runs.are_plain() => return None,
+            Some(variant) if one_method => variant.clone(),
+            _ => run.name.label(),
+        };
+        Some(run.label.as_ref().map_or(name.clone(), |label| format!("{name}, {label}")))
     };
     let same = |a: &Run, b: &Run| {
+        if a.label != b.label {
+            return false;
+        }
         let (a, b) = (&a.name, &b.name);
         (&a.method, &a.variant, &a.world, a.eta) == (&b.method, &b.variant, &b.world, b.eta)
     };

@@ -64,7 +64,7 @@ fn environment(table: &Table, world: &World, block: Block) -> String {
          \\resizebox{{\\ifdim\\width>\\linewidth\\linewidth\\else\\width\\fi}}{{!}}{{%\n  \
          \\begin{{tabular}}{{{align}{}}}\n    \\toprule\n{header}    \\midrule\n{}    \\bottomrule\n  \\end{{tabular}}}}\n\\end{{table}}\n",
         escaped(&world.name),
-        escaped(&block.title(table)),
+        escaped(&block.title(world)),
         label(&world.name),
         label(&format!("{block:?}").to_lowercase()),
         "r".repeat(columns.len()),

@@ -23,10 +23,15 @@ pub mod page;
 pub mod records;
 pub mod render;
 pub mod runs;
+pub mod settings;
 pub mod statistics;
 pub mod table;
 
-use crate::experiment::registry::Registry;
+pub use render::screen_width;
+
+use crate::experiment::config::RunConfig;
+use crate::experiment::failure::RunError;
+use crate::experiment::registry::{Limits, Registry};
 use crate::files::write_in_place;
 use crate::game::returns::ReturnLaw;
 use figures::Figures;
@@ -38,7 +43,7 @@ use runs::Runs;
 use std::path::{Path, PathBuf};
 use table::{Results, Table};
 
-/// What the report asks about worlds, which it knows only by their names.
+/// What the report asks about worlds, which it knows only by their names, and about configurations.
 pub trait Worlds {
     /// The place where episodes of the world with these constants happen; `None` if it is not known or
     /// refuses the constants.
@@ -53,6 +58,36 @@ pub trait Worlds {
         gamma: f64,
         etas: &[f64],
     ) -> Option<Vec<ReturnLaw>>;
+
+    /// The best policy that is known at a budget.
+    fn optimum(&self, world: &str, constants: &toml::Table, gamma: f64, eta: f64) -> Optimum;
+
+    /// What an episode can be; `None` if the world is not known or does not say.
+    fn limits(&self, world: &str, constants: &toml::Table, gamma: f64) -> Option<Limits>;
+
+    /// All constants of the world: the given ones over its defaults; `None` if the world is not known or
+    /// refuses them.
+    fn constants(&self, world: &str, given: &toml::Table) -> Option<toml::Table>;
+
+    /// The default discount.
+    fn gamma(&self) -> f64;
+
+    /// The `config.toml` of a run with all keys of this version; `None` if it is of another version or
+    /// another program.
+    fn configuration(&self, text: &str) -> Option<toml::Table>;
+}
+
+/// What is known of the optimum of a task.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Optimum {
+    /// The law of the return of the best policy that is known.
+    Known(ReturnLaw),
+    /// The program comes without a certificate of these constants and this budget.
+    NotShipped,
+    /// It cannot be computed, for this reason.
+    Refused(String),
+    /// The world has no yardstick, or is not known.
+    None,
 }
 
 impl Worlds for Registry {
@@ -68,6 +103,38 @@ impl Worlds for Registry {
         etas: &[f64],
     ) -> Option<Vec<ReturnLaw>> {
         self.named(world)?.frontier(constants, gamma, etas)
+    }
+
+    fn optimum(&self, world: &str, constants: &toml::Table, gamma: f64, eta: f64) -> Optimum {
+        let Some(world) = self.named(world) else { return Optimum::None };
+        match world.optimum(constants, gamma, eta) {
+            Ok(Some(law)) => Optimum::Known(law),
+            Ok(None) => Optimum::NotShipped,
+            Err(RunError::NoYardstick(_)) => Optimum::None,
+            Err(error) => Optimum::Refused(error.to_string()),
+        }
+    }
+
+    fn limits(&self, world: &str, constants: &toml::Table, gamma: f64) -> Option<Limits> {
+        self.named(world)?.limits(constants, gamma)
+    }
+
+    fn constants(&self, world: &str, given: &toml::Table) -> Option<toml::Table> {
+        let world = self.named(world)?.info();
+        let mut table: toml::Table = toml::from_str(world.defaults).ok()?;
+        table.extend(given.clone());
+        (world.check)(table).ok()
+    }
+
+    fn gamma(&self) -> f64 {
+        let defaults = toml::from_str::<toml::Table>(self.catalogue().annotated_default());
+        let gamma = defaults.ok().and_then(|table| table["gamma"].as_float());
+        gamma.expect("the default configuration has a discount")
+    }
+
+    fn configuration(&self, text: &str) -> Option<toml::Table> {
+        let run = RunConfig::parse(Path::new("config.toml"), text, self.catalogue()).ok()?;
+        toml::Table::try_from(run).ok()
     }
 }
 
@@ -130,26 +197,33 @@ pub enum ReportError {
 }
 
 /// Reads the runs below `dir` and writes `runs.csv`, `table.csv`, `table.md`, `table.tex` and `cross.csv`
-/// into it. Returns the table as text for a terminal (at most 140 columns wide, beside long names).
+/// into it. Returns the table as text of so many columns for a terminal (see [`screen_width`]).
 ///
 /// Each file is replaced in one step: a reader sees the old one or the new one, never a part.
 ///
 /// # Errors
 /// If `dir` holds no run or none of its runs can be read, or a result cannot be written.
-pub fn write(dir: &Path) -> Result<String, ReportError> {
-    let runs = Runs::read(dir)?;
+pub fn write(dir: &Path, worlds: &dyn Worlds, width: usize) -> Result<String, ReportError> {
+    let runs = Runs::read(dir, worlds)?;
     let name = names(&[dir]).remove(0);
     let results = Results::of(&[(&name, &runs)]);
-    write_tables(dir, &runs, &results).map(|(_, terminal)| terminal)
+    Ok(Terminal { width, file: "table.md" }.render(&write_tables(dir, &runs, &results)?))
 }
 
 /// What [`write_all`] has written.
 #[derive(Debug)]
 pub struct Written {
-    /// The table as text for a terminal.
-    pub table: String,
+    /// The table.
+    pub table: Table,
     /// The figures, and those left out.
     pub figures: Figures,
+}
+
+impl Written {
+    /// The table as text of so many columns for a terminal.
+    pub fn terminal(&self, width: usize) -> String {
+        Terminal { width, file: "table.md" }.render(&self.table)
+    }
 }
 
 /// All that [`write()`] writes, the figures in `DIR/figures` as SVG and PNG, and `report.html`, a page
@@ -158,47 +232,55 @@ pub struct Written {
 /// # Errors
 /// As [`write()`].
 pub fn write_all(dir: &Path, worlds: &dyn Worlds) -> Result<Written, ReportError> {
-    let runs = Runs::read(dir)?;
+    let runs = Runs::read(dir, worlds)?;
     let name = names(&[dir]).remove(0);
     let results = Results::of(&[(&name, &runs)]);
-    let (panels, notes) = figures::panels(&results);
-    let figures = figures::draw(&panels, notes, worlds);
-    let (table, terminal) = write_tables(dir, &runs, &results)?;
+    let (panels, notes) = figures::panels(&results, worlds);
+    let mut figures = figures::draw(&panels, notes, worlds);
+    figures.left_out.clone_from(&runs.notes);
+    let table = write_tables(dir, &runs, &results)?;
     let page = page::render(&name, &table, &panels, &figures, worlds);
     persist_figures(dir, &figures)?;
     persist(&dir.join("report.html"), page.as_bytes())?;
-    Ok(Written { table: terminal, figures })
+    Ok(Written { table, figures })
 }
 
-fn write_tables(
-    dir: &Path,
-    runs: &Runs,
-    results: &[Results],
-) -> Result<(Table, String), ReportError> {
+fn write_tables(dir: &Path, runs: &Runs, results: &[Results]) -> Result<Table, ReportError> {
     persist(&dir.join("runs.csv"), runs.to_csv().as_bytes())?;
     let groups: Vec<&Group> = results.iter().flat_map(|results| &results.groups).collect();
     persist(&dir.join("cross.csv"), cross::to_csv(&groups).as_bytes())?;
     let table = Table::new(results);
-    let terminal = write_table(&table, &dir.join("table"))?;
-    Ok((table, terminal))
+    write_table(&table, &dir.join("table"))?;
+    Ok(table)
 }
 
 /// Puts `dir` and `others` side by side, as `comparison.csv`, `comparison.md` and `comparison.tex` in
-/// `dir`. Returns the table as text for a terminal. Differences are to `dir`, and if it has several methods
+/// `dir`. Returns the table as text of so many columns for a terminal. Differences are to `dir`, and if it has several methods
 /// to its first one.
 ///
 /// # Errors
 /// As [`write()`], of any of the folders.
-pub fn write_comparison(dir: &Path, others: &[PathBuf]) -> Result<String, ReportError> {
-    write_table(&comparison(dir, others)?, &dir.join("comparison"))
+pub fn write_comparison(
+    dir: &Path,
+    others: &[PathBuf],
+    worlds: &dyn Worlds,
+    width: usize,
+) -> Result<String, ReportError> {
+    let table = comparison(dir, others, worlds)?;
+    write_table(&table, &dir.join("comparison"))?;
+    Ok(Terminal { width, file: "comparison.md" }.render(&table))
 }
 
 /// The table for programs: one object with `schema`, `columns`, `worlds` and `notes`. Writes nothing.
 ///
 /// # Errors
 /// As [`write()`].
-pub fn table_json(dir: &Path, others: &[PathBuf]) -> Result<serde_json::Value, ReportError> {
-    Ok(Json.value(&comparison(dir, others)?))
+pub fn table_json(
+    dir: &Path,
+    others: &[PathBuf],
+    worlds: &dyn Worlds,
+) -> Result<serde_json::Value, ReportError> {
+    Ok(Json.value(&comparison(dir, others, worlds)?))
 }
 
 /// Draws the figures of the runs below `dir` into `DIR/figures`, each as SVG and PNG.
@@ -206,11 +288,12 @@ pub fn table_json(dir: &Path, others: &[PathBuf]) -> Result<serde_json::Value, R
 /// # Errors
 /// As [`write()`].
 pub fn write_figures(dir: &Path, worlds: &dyn Worlds) -> Result<Figures, ReportError> {
-    let runs = Runs::read(dir)?;
+    let runs = Runs::read(dir, worlds)?;
     let name = names(&[dir]).remove(0);
     let results = Results::of(&[(&name, &runs)]);
-    let (panels, notes) = figures::panels(&results);
-    let figures = figures::draw(&panels, notes, worlds);
+    let (panels, notes) = figures::panels(&results, worlds);
+    let mut figures = figures::draw(&panels, notes, worlds);
+    figures.left_out.clone_from(&runs.notes);
     persist_figures(dir, &figures)?;
     Ok(figures)
 }
@@ -233,10 +316,11 @@ fn persist_figures(dir: &Path, figures: &Figures) -> Result<(), ReportError> {
     Ok(())
 }
 
-fn comparison(dir: &Path, others: &[PathBuf]) -> Result<Table, ReportError> {
+fn comparison(dir: &Path, others: &[PathBuf], worlds: &dyn Worlds) -> Result<Table, ReportError> {
     let dirs: Vec<&Path> =
         std::iter::once(dir).chain(others.iter().map(PathBuf::as_path)).collect();
-    let runs: Vec<Runs> = dirs.iter().map(|dir| Runs::read(dir)).collect::<Result<_, _>>()?;
+    let runs: Vec<Runs> =
+        dirs.iter().map(|dir| Runs::read(dir, worlds)).collect::<Result<_, _>>()?;
     let names = names(&dirs);
     let folders: Vec<(&str, &Runs)> = names.iter().map(String::as_str).zip(&runs).collect();
     Ok(Table::new(&Results::of(&folders)))
@@ -252,11 +336,10 @@ fn names(dirs: &[&Path]) -> Vec<String> {
         .collect()
 }
 
-fn write_table(table: &Table, stem: &Path) -> Result<String, ReportError> {
+fn write_table(table: &Table, stem: &Path) -> Result<(), ReportError> {
     persist(&stem.with_extension("csv"), Csv.render(table).as_bytes())?;
     persist(&stem.with_extension("md"), Markdown.render(table).as_bytes())?;
-    persist(&stem.with_extension("tex"), Latex.render(table).as_bytes())?;
-    Ok(Terminal.render(table))
+    persist(&stem.with_extension("tex"), Latex.render(table).as_bytes())
 }
 
 fn persist(path: &Path, bytes: &[u8]) -> Result<(), ReportError> {

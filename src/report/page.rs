@@ -5,6 +5,7 @@
 use super::Worlds;
 use super::figures::{Figures, Panel, Picture};
 use super::render::{columns, legend, row_headings, row_name, seeds, words};
+use super::runs::Run;
 use super::table::{Block, Cell, Row, Table, World};
 use crate::experiment::figure_data::StoredEpisode;
 use lava_envs::scene::Scene;
@@ -50,7 +51,7 @@ pub fn render(
                     section id="tables" { h2 { "Tables" } (tables(table)) }
                     section id="figures" { h2 { "Figures" } (pictures(figures)) }
                     section id="episodes-played" { h2 { "Episodes" } (player(&episodes)) }
-                    section id="made" { h2 { "How it was made" } (made(table)) }
+                    section id="made" { h2 { "How it was made" } (made(table, panels)) }
                 }
                 script { (PreEscaped(include_str!("page.js"))) }
             }
@@ -105,7 +106,7 @@ fn tables(table: &Table) -> Markup {
         @for world in &table.worlds {
             @for block in Block::ALL {
                 @if !columns(world, block).is_empty() {
-                    h3 { (world.name) ": " (block.title(table)) }
+                    h3 { (world.name) ": " (block.title(world)) }
                     div.scroll tabindex="0" { (one_table(table, world, block)) }
                 }
             }
@@ -204,10 +205,79 @@ fn player(episodes: &Episodes) -> Markup {
     }
 }
 
-fn made(table: &Table) -> Markup {
+fn made(table: &Table, panels: &[Panel]) -> Markup {
     html! {
         p { "Only from the records of the runs, by " code { "cvar-game report" } " " (env!("CARGO_PKG_VERSION")) "; nothing was simulated for this page." }
-        dl { @for (term, meaning) in legend(table, "green and bold") { dt { (term) } dd { (meaning) } } }
+        (origins(panels))
+        (settings(panels))
+        details open {
+            summary { "What the columns mean" }
+            dl { @for (term, meaning) in legend(table, "green and bold") { dt { (term) } dd { (meaning) } } }
+        }
+    }
+}
+
+/// Programs and machines that the runs come from, with the number of runs of each.
+fn origins(panels: &[Panel]) -> Markup {
+    let mut origins: Vec<([String; 5], usize)> = Vec::new();
+    for run in panels.iter().flat_map(|panel| panel.group.runs) {
+        let origin = match &run.manifest {
+            None => ["of another program", "", "", "", ""].map(str::to_owned),
+            Some(of) => [
+                of.version.clone(),
+                of.commit.clone().unwrap_or_else(|| "not built in a checkout".to_owned()),
+                match &of.libtorch {
+                    Some(version) => format!("{}, libtorch {version}", of.device),
+                    None => of.device.clone(),
+                },
+                of.cpu.clone(),
+                of.cores.map_or(String::new(), |cores| cores.to_string()),
+            ],
+        };
+        match origins.iter_mut().find(|(known, _)| *known == origin) {
+            Some((_, count)) => *count += 1,
+            None => origins.push((origin, 1)),
+        }
+    }
+    html! {
+        details {
+            summary { "Program and machine" }
+            div.scroll tabindex="0" { table {
+                thead { tr {
+                    th scope="col" { "runs" }
+                    @for title in ["version", "commit", "device", "processor", "cores"] { th.text scope="col" { (title) } }
+                } }
+                tbody { @for (origin, count) in &origins {
+                    tr { td { (count) } @for field in origin { td.text { (field) } } }
+                } }
+            } }
+        }
+    }
+}
+
+/// The resolved configuration of each row, eta and seed apart.
+fn settings(panels: &[Panel]) -> Markup {
+    let mut shown: Vec<(String, &Run, &str)> = Vec::new();
+    for panel in panels {
+        let Some(run) = panel.group.runs.iter().find(|run| run.settings.text.is_some()) else {
+            continue;
+        };
+        let method = panel.group.method.as_deref().unwrap_or(&run.name.method);
+        let name = format!("{}, {method}", panel.group.env);
+        if let Some(text) = run.settings.text.as_deref()
+            && shown.iter().all(|(known, _, _)| *known != name)
+        {
+            shown.push((name, run, text));
+        }
+    }
+    html! {
+        @for (name, run, text) in &shown {
+            details {
+                summary { "Settings: " (name) }
+                p { "Of the run " code { (run.files.path) } ". Its other budgets and seeds have the same task and training." }
+                pre tabindex="0" { (text) }
+            }
+        }
     }
 }
 
@@ -233,11 +303,8 @@ impl Episodes {
     fn of(panels: &[Panel], worlds: &dyn Worlds) -> Episodes {
         let mut episodes = Episodes { scenes: Vec::new(), runs: Vec::new() };
         for panel in panels {
-            let constants = panel.constants();
-            let Some(scene) = constants.and_then(|of| worlds.scene(panel.group.env, &of.world))
-            else {
-                continue;
-            };
+            let constants = &panel.task().constants;
+            let Some(scene) = worlds.scene(panel.group.env, constants) else { continue };
             let stored = panel.seeds.iter().filter_map(|(run, records)| {
                 let data = records.figure_data.as_ref().filter(|of| !of.stored.is_empty())?;
                 Some((run, &data.stored))

@@ -5,7 +5,7 @@
 //! [`Cell`] the numbers, [`legend`] the words below.
 
 use super::runs::{csv_text, number};
-use super::statistics::Interval;
+use super::statistics::{Estimate, Interval};
 use super::table::{Block, COLUMNS, Cell, Column, Format, Row, Table, World};
 use crate::experiment::artefacts::SCHEMA;
 use comfy_table::{CellAlignment, LineStyle, TableStyle};
@@ -17,8 +17,9 @@ const MISSING: &str = "–";
 /// Marks best values on a terminal.
 const BEST: &str = "*";
 
-/// Width of running text on a terminal.
-const TEXT_WIDTH: usize = 110;
+/// Columns of text where there is no terminal, and the fewest and the most of one that are used.
+const USUAL_WIDTH: usize = 100;
+const WIDTHS: [usize; 2] = [80, 140];
 
 /// Lines across, none down: a separator between columns would cost the width that intervals need.
 const STYLE: TableStyle = TableStyle::new()
@@ -113,63 +114,202 @@ pub(super) fn seeds(row: &Row) -> (String, Option<String>) {
     (row.seeds.to_string(), failed)
 }
 
-/// For a terminal, at most 140 columns wide (and wider only for long names): values above their intervals.
-pub struct Terminal;
+/// The columns of text of the terminal that standard output is, from 80 to 140; 100 where it is none.
+pub fn screen_width() -> usize {
+    let found = console::Term::stdout().size_checked();
+    found.map_or(USUAL_WIDTH, |(_, width)| usize::from(width).clamp(WIDTHS[0], WIDTHS[1]))
+}
+
+/// For a terminal: values above their intervals. What is wider than the screen goes on below, and the words
+/// are few; all of them are in the file that is written with it.
+pub struct Terminal {
+    /// Columns of text.
+    pub width: usize,
+    /// The file with the same table and all words.
+    pub file: &'static str,
+}
+
+/// What the tables on a screen need words for.
+#[derive(Default)]
+struct Shown {
+    columns: Vec<&'static Column>,
+    interval: bool,
+    missing: bool,
+    best: bool,
+}
 
 impl Render for Terminal {
     fn render(&self, table: &Table) -> String {
         let mut text = String::new();
+        let mut shown = Shown::default();
         for world in &table.worlds {
             // The others are for reading at leisure.
             for block in [Block::Returns, Block::Game, Block::Comparison] {
-                let title = block.title(table);
                 let columns = columns(world, block);
-                if columns.is_empty() {
-                    continue;
+                if !columns.is_empty() {
+                    text += &self.block(table, world, &block.title(world), &columns, &mut shown);
                 }
-                let mut drawn = comfy_table::Table::new();
-                drawn.load_style(STYLE);
-                let titles = columns.iter().map(|(_, column)| column.title);
-                drawn.set_header(row_headings(table).into_iter().chain(titles));
-                for row in &world.rows {
-                    let cells = columns.iter().map(|&(place, column)| {
-                        let (value, below) = words(column.format, row.cells[place]);
-                        (value + if row.best[place] { BEST } else { "" }, below)
-                    });
-                    let cells = std::iter::once(seeds(row)).chain(cells).map(|(value, below)| {
-                        below.map_or(value.clone(), |below| format!("{value}\n{below}"))
-                    });
-                    drawn.add_row(row_name(table, row).into_iter().chain(cells));
-                }
-                for column in drawn.column_iter_mut() {
-                    column.set_cell_alignment(CellAlignment::Right);
-                }
-                text += &format!("{}: {title}\n{}\n\n", world.name, drawn.trim_fmt());
             }
         }
-        let legend = legend(table, BEST);
-        let width = legend.iter().map(|(term, _)| term.chars().count()).max().unwrap_or_default();
-        for (term, meaning) in &legend {
-            text += &wrapped(meaning, &format!("{term:<width$}  "), width + 2);
-        }
+        text += &wrapped(&self.legend(&shown), self.width, "", 0);
         // Last, where the eye is when a long output has scrolled by.
         for note in &table.notes {
-            text += &wrapped(note, "\n! ", 2);
+            text += &wrapped(note, self.width, "\n! ", 2);
         }
         text
     }
 }
 
+impl Terminal {
+    /// One block of a world, in as many pieces below each other as the width needs.
+    fn block(
+        &self,
+        table: &Table,
+        world: &World,
+        title: &str,
+        columns: &[(usize, &'static Column)],
+        shown: &mut Shown,
+    ) -> String {
+        let name_width = (self.width / 3).max(1);
+        let mut head: Vec<Vec<String>> =
+            vec![row_headings(table).into_iter().map(str::to_owned).collect()];
+        for row in &world.rows {
+            let (count, failed) = seeds(row);
+            let count = failed.map_or(count.clone(), |failed| format!("{count}\n{failed}"));
+            let name = row_name(table, row).into_iter().map(|name| folded(&name, name_width));
+            head.push(name.chain([count]).collect());
+        }
+        let cells = |&(place, column): &(usize, &'static Column)| -> Vec<String> {
+            let cell = |row: &Row| {
+                let (value, below) = words(column.format, row.cells[place]);
+                let value = value + if row.best[place] { BEST } else { "" };
+                below.map_or(value.clone(), |below| format!("{value}\n{below}"))
+            };
+            std::iter::once(column.title.to_owned()).chain(world.rows.iter().map(cell)).collect()
+        };
+        let columns: Vec<(usize, &'static Column, Vec<String>)> =
+            columns.iter().map(|of| (of.0, of.1, cells(of))).collect();
+        for (place, column, _) in &columns {
+            for row in &world.rows {
+                shown.best |= row.best[*place];
+                shown.missing |= row.cells[*place] == Cell::Missing;
+                shown.interval |=
+                    matches!(row.cells[*place], Cell::Estimate(Estimate { interval: Some(_), .. }));
+            }
+            shown.columns.push(column);
+        }
+        // A space on either side of each column.
+        let wide = |cells: &[String]| {
+            let lines = cells.iter().flat_map(|cell| cell.lines());
+            lines.map(|line| line.chars().count()).max().unwrap_or_default() + 2
+        };
+        let before: usize = (0..head[0].len())
+            .map(|place| wide(&head.iter().map(|line| line[place].clone()).collect::<Vec<_>>()))
+            .sum();
+        let widths: Vec<usize> = columns.iter().map(|(_, _, cells)| wide(cells)).collect();
+        // The last space is not printed.
+        let lengths = balanced(&widths, (self.width + 1).saturating_sub(before));
+        let mut rest = columns.iter().map(|(_, _, cells)| cells);
+        let pieces: Vec<Vec<&Vec<String>>> =
+            lengths.iter().map(|length| rest.by_ref().take(*length).collect()).collect();
+        let mut text = String::new();
+        for (number, piece) in pieces.iter().enumerate() {
+            let mut drawn = comfy_table::Table::new();
+            drawn.load_style(STYLE);
+            for (place, head) in head.iter().enumerate() {
+                let line = head.iter().chain(piece.iter().map(|cells| &cells[place]));
+                if place == 0 {
+                    drawn.set_header(line);
+                } else {
+                    drawn.add_row(line);
+                }
+            }
+            for column in drawn.column_iter_mut() {
+                column.set_cell_alignment(CellAlignment::Right);
+            }
+            let more = if number > 0 { ", continued" } else { "" };
+            text += &format!("{}: {title}{more}\n{}\n\n", world.name, drawn.trim_fmt());
+        }
+        text
+    }
+
+    /// The words below the tables.
+    fn legend(&self, shown: &Shown) -> String {
+        let mut said: Vec<String> = Vec::new();
+        for column in &shown.columns {
+            let text = format!("{}: {}.", column.title, column.brief);
+            if !column.brief.is_empty() && !said.contains(&text) {
+                said.push(text);
+            }
+        }
+        if shown.interval {
+            said.push("[low, high]: 95 % interval over seeds.".to_owned());
+        }
+        if shown.best {
+            said.push(format!("{BEST}: the best, or not distinguishable from it."));
+        }
+        if shown.missing {
+            said.push(format!("{MISSING}: no number, or too few episodes for it."));
+        }
+        said.push(format!("{} explains every column.", self.file));
+        said.join(" ")
+    }
+}
+
+/// How many columns of these widths go into each of the fewest pieces that fit into `width`, the widest of
+/// which is as narrow as can be. A column that is wider than that has a piece of its own.
+fn balanced(widths: &[usize], width: usize) -> Vec<usize> {
+    let pieces = |limit: usize| {
+        let mut pieces: Vec<usize> = Vec::new();
+        let mut used = 0;
+        for width in widths {
+            used += width;
+            match pieces.last_mut() {
+                Some(last) if used <= limit => *last += 1,
+                _ => {
+                    pieces.push(1);
+                    used = *width;
+                }
+            }
+        }
+        pieces
+    };
+    let fewest = pieces(width);
+    let narrower = (0..width).map(pieces).find(|found| found.len() == fewest.len());
+    narrower.unwrap_or(fewest)
+}
+
+/// A name on lines of at most so many characters, broken after its separators where it can be.
+fn folded(name: &str, width: usize) -> String {
+    let mut lines = vec![String::new()];
+    for part in name.split_inclusive(['/', '+', ' ', ',']) {
+        let last = lines.last_mut().expect("there is one");
+        let needed = last.chars().count() + part.trim_end().chars().count();
+        if !last.is_empty() && needed > width {
+            lines.push(String::new());
+        }
+        for character in part.chars() {
+            if lines.last().expect("there is one").chars().count() == width {
+                lines.push(String::new());
+            }
+            lines.last_mut().expect("there is one").push(character);
+        }
+    }
+    lines.iter().map(|line| line.trim_end()).collect::<Vec<_>>().join("\n")
+}
+
 /// Running text broken at words, after `first` and with later lines moved in.
-fn wrapped(text: &str, first: &str, indent: usize) -> String {
+fn wrapped(text: &str, width: usize, first: &str, indent: usize) -> String {
     let mut out = first.to_owned();
     let mut length = indent;
     for (place, word) in text.split_whitespace().enumerate() {
         let needed = word.chars().count() + usize::from(place > 0);
-        if place > 0 && length + needed > TEXT_WIDTH {
-            out += &format!("\n{}", " ".repeat(indent));
-            length = indent;
-        } else if place > 0 {
+        if place > 0 && length + needed > width {
+            out += &format!("\n{}{word}", " ".repeat(indent));
+            length = indent + word.chars().count();
+            continue;
+        }
+        if place > 0 {
             out.push(' ');
         }
         out += word;
@@ -191,7 +331,7 @@ impl Render for Markdown {
         for world in &table.worlds {
             text += &format!("\n## {}\n", world.name);
             for block in Block::ALL {
-                let title = block.title(table);
+                let title = block.title(world);
                 let columns = columns(world, block);
                 if columns.is_empty() {
                     continue;
@@ -314,8 +454,9 @@ impl Render for Csv {
 }
 
 /// JSON: `{schema, columns: {KEY: {title, meaning}}, worlds: [{env, episodes, checks, rows: [{folder,
-/// method, variant, eta, alpha, seeds, failures, KEY: ..}]}], notes}`. An estimate is `{value, low, high}`,
-/// the worst seed `{value, seed}`, a count a number; `null` where there is no number or no variant.
+/// method, variant, settings, eta, alpha, seeds, failures, KEY: ..}]}], notes}`. An estimate is `{value, low,
+/// high}`, the worst seed `{value, seed}`, a count a number; `null` where there is no number, no variant or no
+/// other settings.
 pub struct Json;
 
 impl Json {
@@ -337,6 +478,7 @@ impl Json {
                 "folder": row.folder,
                 "method": row.method,
                 "variant": row.variant,
+                "settings": row.settings,
                 "eta": row.eta,
                 "alpha": 1.0 / row.eta,
                 "seeds": row.seeds,
@@ -373,5 +515,25 @@ impl Json {
 impl Render for Json {
     fn render(&self, table: &Table) -> String {
         format!("{:#}\n", self.value(table))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::{balanced, folded, wrapped};
+
+    #[test]
+    fn columns_are_spread_over_the_fewest_pieces() {
+        assert_eq!(balanced(&[10, 10, 10, 10], 40), [4]);
+        assert_eq!(balanced(&[10, 10, 10, 10], 39), [2, 2]);
+        assert_eq!(balanced(&[10, 10, 10, 10], 1), [1, 1, 1, 1]);
+        assert_eq!(balanced(&[5, 50, 5], 20), [1, 1, 1]);
+    }
+
+    #[test]
+    fn names_and_notes_are_broken_at_words() {
+        assert_eq!(folded("game/k-1, slip=0.05", 10), "game/k-1,\nslip=0.05");
+        assert_eq!(folded("abcdefgh", 3), "abc\ndef\ngh");
+        assert_eq!(wrapped("one two three", 9, "! ", 2), "! one two\n  three\n");
     }
 }

@@ -19,6 +19,14 @@
 //! | `chance` | who decided the outcomes: `nominal`, `antagonist` (the learned one) or `exact` (the worst case); may be left out: `nominal` |
 //! | `clearance` | least distance to lava in the episode; may be left out |
 //!
+//! A return that the world cannot have, more steps than its time limit and a clearance that is no distance
+//! are refused. Their regret is computed here, where the optimum is known: exactly, or by a certificate that
+//! comes with the program. A `config.toml` beside the episodes may say which task they are of
+//! ([`super::settings`]).
+//!
+//! Runs of one method, variant, world and eta whose task or training differ are not of one row; each has a
+//! label that says what differs, such as `slip=0.3`.
+//!
 //! `runs.csv`, ordered by method, variant, world, eta and seed; alpha = 1/eta; numbers with six decimals; an empty
 //! field is a number that does not exist (say, a certificate where the world has no yardstick) or a
 //! CVaR whose tail holds fewer than ten recorded episodes:
@@ -27,6 +35,7 @@
 //! |---|---|
 //! | `env`, `eta`, `seed` | which run |
 //! | `method`, `variant` | after `env`, where there are other runs than those of the method `game` without a variant |
+//! | `settings` | after them, where runs of one method, variant and world differ in their settings: the label |
 //! | `status` | `finished` or `failed` |
 //! | `steps`, `seconds` | environment steps and wall-clock seconds of training |
 //! | `greedy_mean`, `greedy_cvar` | mean and CVaR_alpha of the return J, greedy protagonist, nominal chance |
@@ -44,11 +53,13 @@
 //! | `budget_use` | max over audited trajectories of prod delta / eta, at most 1 |
 //! | `budget_violations` | steps or trajectories beyond tolerance, 0 |
 
-use super::{ReportError, statistics};
+use super::settings::{self, Settings, Task};
+use super::{Optimum, ReportError, Worlds, statistics};
 use crate::experiment::archive::{FIRST_METHOD, RunFiles, RunName, Store};
 use crate::experiment::artefacts::{
     Audit, Certificate, Chance, Evaluation, Manifest, Play, SCHEMA,
 };
+use crate::experiment::registry::Limits;
 use crate::game::returns::{Atom, ReturnLaw};
 use crate::learn::policy::Mode;
 use lava_envs::End;
@@ -69,8 +80,47 @@ pub struct Run {
     pub seconds: f64,
     /// What the evaluation found; a failed run may have none.
     pub evaluation: Option<Evaluation>,
+    /// How far it is from the optimum.
+    pub regret: Regret,
+    /// What it was trained and evaluated on.
+    pub settings: Settings,
+    /// What tells it apart from runs of the same method, variant and world with other settings.
+    pub label: Option<String>,
+    /// Where it comes from; results of other programs do not say.
+    pub manifest: Option<Manifest>,
     /// Its files.
     pub files: RunFiles,
+}
+
+/// V*(eta) - CVaR_{1/eta} of the greedy protagonist under nominal chance.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Regret {
+    /// It is known.
+    Known {
+        /// The regret.
+        value: f64,
+        /// Its standard error; 0 where it is exact.
+        standard_error: f64,
+        /// The best CVaR, where the regret is computed from the run's law of the return; `None` where the
+        /// run's evaluation has it.
+        best: Option<f64>,
+    },
+    /// The program comes without a certificate for it.
+    NotShipped,
+    /// The optimum cannot be computed, for this reason.
+    Refused(String),
+    /// The world has no yardstick, or the run no CVaR.
+    None,
+}
+
+impl Regret {
+    /// The regret and its standard error.
+    pub fn known(&self) -> Option<(f64, f64)> {
+        match *self {
+            Regret::Known { value, standard_error, .. } => Some((value, standard_error)),
+            _ => None,
+        }
+    }
 }
 
 impl Run {
@@ -172,6 +222,10 @@ const METHOD_COLUMNS: [Column; 2] = [
     ("variant", |of| Field::Text(of.run.name.variant.clone().unwrap_or_default())),
 ];
 
+/// The column that tells runs of one method apart by their settings, where there are such.
+const SETTINGS_COLUMN: Column =
+    ("settings", |of| Field::Text(of.run.label.clone().unwrap_or_default()));
+
 /// The other columns, in order.
 const COLUMNS: [Column; 31] = [
     ("env", |of| Field::Text(of.run.name.world.clone())),
@@ -208,8 +262,8 @@ const COLUMNS: [Column; 31] = [
         let (value, cvar) = (of.game.map(ReturnLaw::mean), of.own_cvar(of.sampled));
         Field::Number(value.zip(cvar).map(|(value, cvar)| value - cvar))
     }),
-    ("regret", |of| Field::Number(of.certificate.map(|of| of.regret))),
-    ("regret_se", |of| Field::Number(of.certificate.map(|of| of.regret_standard_error))),
+    ("regret", |of| Field::Number(of.run.regret.known().map(|(regret, _)| regret))),
+    ("regret_se", |of| Field::Number(of.run.regret.known().map(|(_, error)| error))),
     ("antagonist_gap", |of| Field::Number(of.certificate.map(|of| of.antagonist_gap))),
     ("antagonist_gap_se", |of| {
         Field::Number(of.certificate.map(|of| of.antagonist_gap_standard_error))
@@ -230,20 +284,27 @@ pub struct Runs {
 
 impl Runs {
     /// Reads the runs of a results folder, from their folders and from its archive. A run with a file
-    /// that cannot be read, or is not what it should be, is left out, and a note names the file.
+    /// that cannot be read, or is not what it should be, is left out, and a note names the file; so is an
+    /// archive.
     ///
     /// # Errors
-    /// If there is no run, none can be read, or the folder or its archive cannot be read.
-    pub fn read(dir: &Path) -> Result<Runs, ReportError> {
+    /// If there is no run, none can be read, or the folder cannot be read.
+    pub fn read(dir: &Path, worlds: &dyn Worlds) -> Result<Runs, ReportError> {
         let unreadable = |path, source| ReportError::Read { path, source };
-        let store = Store::open(dir).map_err(|error| unreadable(Store::archive(dir), error))?;
+        let mut lost = None;
+        let store = Store::open(dir).unwrap_or_else(|error| {
+            lost = Some(unreadable(Store::archive(dir), error));
+            Store::without_archive(dir)
+        });
         let found = store.list().map_err(|(path, source)| unreadable(path, source))?;
         let (mut runs, mut notes) = (Vec::new(), found.notes);
+        notes.extend(lost.iter().map(|error| format!("LEFT OUT: {}. {error}.", "all packed runs")));
         let mut in_progress = Vec::new();
-        let mut damaged = None;
+        let mut damaged = lost;
+        let mut tasks = Tasks { worlds, known: Vec::new() };
         for files in found.runs {
             let path = files.path.clone();
-            match read_run(files) {
+            match read_run(files, &mut tasks) {
                 Ok(Some(run)) => runs.push(run),
                 Ok(None) => in_progress.push(path),
                 Err(error) => {
@@ -259,17 +320,7 @@ impl Runs {
             let none = || ReportError::NoRuns { dir: dir.to_path_buf(), notes };
             return Err(damaged.unwrap_or_else(none));
         }
-        let place = |run: &Run| {
-            let of = &run.name;
-            let method = (of.method != FIRST_METHOD, of.method.clone(), of.variant.clone());
-            (method, of.world.clone())
-        };
-        runs.sort_by(|a, b| {
-            let (a_name, b_name) = (&a.name, &b.name);
-            (place(a).cmp(&place(b)))
-                .then(a_name.eta.total_cmp(&b_name.eta))
-                .then(a_name.seed.cmp(&b_name.seed))
-        });
+        sort(&mut runs);
         // `eta-25` and `eta-25.0` are two folders and one experiment.
         if let Some(pair) = runs.windows(2).find(|pair| pair[0].name == pair[1].name) {
             return Err(ReportError::Corrupt {
@@ -277,12 +328,16 @@ impl Runs {
                 what: format!("two folders hold {}", pair[0].name),
             });
         }
+        for of_world in runs.chunk_by_mut(|a, b| line(a) == line(b)) {
+            notes.extend(tell_apart(of_world));
+        }
         Ok(Runs { runs, notes })
     }
 
-    /// Whether all are of the method `game` without a variant, so that rows need not name it.
+    /// Whether all are of the method `game` without a variant and of one kind of settings, so that rows
+    /// need not name them.
     pub fn are_plain(&self) -> bool {
-        self.runs.iter().all(|run| run.name.is_plain())
+        self.runs.iter().all(|run| run.name.is_plain() && run.label.is_none())
     }
 
     /// The text of `runs.csv`.
@@ -290,6 +345,9 @@ impl Runs {
         let mut columns = COLUMNS.to_vec();
         if !self.are_plain() {
             columns.splice(1..1, METHOD_COLUMNS);
+        }
+        if self.runs.iter().any(|run| run.label.is_some()) {
+            columns.insert(3, SETTINGS_COLUMN);
         }
         let header = columns.iter().map(|(name, _)| (*name).to_owned()).collect();
         let row = |run| {
@@ -317,26 +375,174 @@ pub(super) fn csv_text(rows: impl IntoIterator<Item = Vec<String>>) -> String {
     String::from_utf8(bytes).expect("fields are text")
 }
 
+/// What names a row beside its eta and its label: plain runs of `game` come first.
+fn line(run: &Run) -> (bool, &str, Option<&str>, &str) {
+    let of = &run.name;
+    (of.method != FIRST_METHOD, &of.method, of.variant.as_deref(), &of.world)
+}
+
+/// By method and variant, world, eta and seed.
+fn sort(runs: &mut [Run]) {
+    runs.sort_by(|a, b| {
+        let (a_name, b_name) = (&a.name, &b.name);
+        (line(a).cmp(&line(b)))
+            .then(a_name.eta.total_cmp(&b_name.eta))
+            .then(a_name.seed.cmp(&b_name.seed))
+    });
+}
+
+/// Gives runs of one method, variant and world whose settings differ their labels and sorts them by these;
+/// a note says so.
+fn tell_apart(runs: &mut [Run]) -> Option<String> {
+    // One of each kind.
+    let mut kinds: Vec<&Settings> = Vec::new();
+    let mut places = Vec::new();
+    for run in runs.iter() {
+        let known = kinds.iter().position(|kind| kind.are_alike(&run.settings));
+        places.push(known.unwrap_or_else(|| {
+            kinds.push(&run.settings);
+            kinds.len() - 1
+        }));
+    }
+    if kinds.len() == 1 {
+        return None;
+    }
+    let labels = settings::labels(&kinds);
+    let name = &runs[0].name;
+    let note = format!(
+        "{}: the runs of {} in this folder differ in their settings ({}). They are in rows of their own.",
+        name.world,
+        name.label(),
+        labels.join(" | ")
+    );
+    for (run, place) in runs.iter_mut().zip(&places) {
+        run.label = Some(labels[*place].clone());
+    }
+    let order = |run: &Run| labels.iter().position(|label| run.label.as_ref() == Some(label));
+    runs.sort_by_key(order); // stable: by eta and seed
+    Some(note)
+}
+
+/// What the registry says of each task, asked once.
+struct Tasks<'a> {
+    worlds: &'a dyn Worlds,
+    known: Vec<Asked>,
+}
+
+struct Asked {
+    world: String,
+    task: Task,
+    limits: Option<Limits>,
+    /// By eta.
+    optima: Vec<(f64, Optimum)>,
+}
+
+impl Tasks<'_> {
+    fn of(&mut self, world: &str, task: &Task) -> &mut Asked {
+        let place = self.known.iter().position(|of| of.world == world && of.task == *task);
+        let place = place.unwrap_or_else(|| {
+            let limits = self.worlds.limits(world, &task.constants, task.gamma);
+            let (world, task) = (world.to_owned(), task.clone());
+            self.known.push(Asked { world, task, limits, optima: Vec::new() });
+            self.known.len() - 1
+        });
+        &mut self.known[place]
+    }
+
+    fn limits(&mut self, world: &str, task: &Task) -> Option<Limits> {
+        self.of(world, task).limits
+    }
+
+    fn optimum(&mut self, world: &str, task: &Task, eta: f64) -> &Optimum {
+        let worlds = self.worlds;
+        let asked = self.of(world, task);
+        let place = asked.optima.iter().position(|(of, _)| *of == eta);
+        let place = place.unwrap_or_else(|| {
+            asked.optima.push((eta, worlds.optimum(world, &task.constants, task.gamma, eta)));
+            asked.optima.len() - 1
+        });
+        &asked.optima[place].1
+    }
+
+    /// The regret of a run: as it was certified or, where it was not, by its law of the return.
+    fn regret(&mut self, run: &Run) -> Regret {
+        let evaluation = run.evaluation.as_ref();
+        if let Some(found) = evaluation.and_then(|evaluation| evaluation.certificate) {
+            let (value, standard_error) = (found.regret, found.regret_standard_error);
+            return Regret::Known { value, standard_error, best: None };
+        }
+        let alpha = run.alpha();
+        let Some(law) = run.law(Mode::Greedy, Chance::Nominal) else { return Regret::None };
+        let Some(cvar) = statistics::cvar(law, alpha) else { return Regret::None };
+        match self.optimum(&run.name.world, &run.settings.task, run.name.eta) {
+            Optimum::Known(best) => {
+                let error = law.cvar_standard_error(alpha);
+                Regret::Known {
+                    value: best.cvar(alpha) - cvar,
+                    standard_error: error.hypot(best.cvar_standard_error(alpha)),
+                    best: Some(best.cvar(alpha)),
+                }
+            }
+            Optimum::NotShipped => Regret::NotShipped,
+            Optimum::Refused(why) => Regret::Refused(why.clone()),
+            Optimum::None => Regret::None,
+        }
+    }
+}
+
 /// The run of these files; `None` while it is in progress.
-fn read_run(files: RunFiles) -> Result<Option<Run>, ReportError> {
+fn read_run(files: RunFiles, tasks: &mut Tasks) -> Result<Option<Run>, ReportError> {
     let manifest: Option<Manifest> = read_json(&files, "manifest.json")?;
+    if let Some(manifest) = &manifest {
+        require_own(&files, "manifest.json", &manifest.run)?;
+    }
+    let settings = Settings::of(&files.name, read_text(&files, "config.toml")?, tasks.worlds)
+        .map_err(|what| corrupt(&files, "config.toml", what))?;
+    let limits = tasks.limits(&files.name.world, &settings.task);
     let mut file = "evaluation.json";
     let mut evaluation: Option<Evaluation> = read_json(&files, file)?;
     if evaluation.is_none() {
         file = "episodes.csv";
-        evaluation = read_episodes(&files, file)?;
+        evaluation = read_episodes(&files, file, limits)?;
     }
     if let Some(evaluation) = &evaluation {
-        check(evaluation, &files.name).map_err(|what| corrupt(&files, file, what))?;
+        check(evaluation, &files.name, limits).map_err(|what| corrupt(&files, file, what))?;
     }
     let failure = manifest.as_ref().and_then(|manifest| manifest.failure.clone());
     if evaluation.is_none() && failure.is_none() {
         return Ok(None);
     }
     let trained = (evaluation.as_ref().map(|of| (of.steps, of.seconds)))
-        .or(manifest.map(|of| (of.steps, of.seconds)));
+        .or(manifest.as_ref().map(|of| (of.steps, of.seconds)));
     let (steps, seconds) = trained.unwrap_or_default();
-    Ok(Some(Run { name: files.name.clone(), failure, steps, seconds, evaluation, files }))
+    let (name, label, regret) = (files.name.clone(), None, Regret::None);
+    let mut run =
+        Run { name, failure, steps, seconds, evaluation, regret, settings, label, manifest, files };
+    run.regret = tasks.regret(&run);
+    Ok(Some(run))
+}
+
+/// Refuses a file that says that it is of another run. Former versions named no method and no variant.
+pub(super) fn require_own(files: &RunFiles, file: &str, found: &str) -> Result<(), ReportError> {
+    let former = found.split('/').count() == 3;
+    let same = |found: RunName| {
+        let place = |of: &RunName| (of.world.clone(), of.eta, of.seed);
+        found == files.name || former && place(&found) == place(&files.name)
+    };
+    if RunName::parse(found).is_some_and(same) {
+        return Ok(());
+    }
+    Err(corrupt(
+        files,
+        file,
+        format!("it is of the run {found}, but this is the folder of {}", files.path),
+    ))
+}
+
+/// The text of a file; `None` if there is none.
+pub(super) fn read_text(files: &RunFiles, file: &str) -> Result<Option<String>, ReportError> {
+    let text = read_bytes(files, file)?.map(String::from_utf8).transpose();
+    text.map_err(|error| corrupt(files, file, error.to_string()))
 }
 
 pub(super) fn corrupt(files: &RunFiles, file: &str, what: String) -> ReportError {
@@ -390,12 +596,27 @@ fn nominal() -> Chance {
 }
 
 /// The evaluation that the episodes of another program amount to; `None` if there is no such file.
-fn read_episodes(files: &RunFiles, file: &str) -> Result<Option<Evaluation>, ReportError> {
+fn read_episodes(
+    files: &RunFiles,
+    file: &str,
+    limits: Option<Limits>,
+) -> Result<Option<Evaluation>, ReportError> {
     let Some(text) = read_bytes(files, file)? else { return Ok(None) };
     let corrupt = |what: String| corrupt(files, file, what);
     let mut episodes: Vec<Episode> = Vec::new();
-    for line in csv::Reader::from_reader(&text[..]).deserialize() {
-        episodes.push(line.map_err(|error| corrupt(error.to_string()))?);
+    let mut reader = csv::Reader::from_reader(&text[..]);
+    let header = reader.headers().map_err(|error| corrupt(error.to_string()))?.clone();
+    for record in reader.records() {
+        let record = record.map_err(|error| corrupt(error.to_string()))?;
+        let episode: Episode =
+            record.deserialize(Some(&header)).map_err(|error| corrupt(error.to_string()))?;
+        possible(episode.value, episode.steps, limits).and(distance(episode.clearance)).map_err(
+            |what| {
+                let line = record.position().map_or(0, csv::Position::line);
+                corrupt(format!("line {line}: {what}"))
+            },
+        )?;
+        episodes.push(episode);
     }
     if episodes.is_empty() {
         return Err(corrupt("it has no episodes".to_owned()));
@@ -434,8 +655,42 @@ fn read_episodes(files: &RunFiles, file: &str) -> Result<Option<Evaluation>, Rep
     }))
 }
 
+/// Slack of a return that another program has rounded.
+const ROUNDING: f64 = 1e-3;
+
+/// Whether an episode can have this return and this length.
+fn possible(value: f64, steps: u32, limits: Option<Limits>) -> Result<(), String> {
+    if !value.is_finite() {
+        return Err(format!("the return {value} is no finite number"));
+    }
+    let Some(Limits { returns: [least, greatest], horizon }) = limits else { return Ok(()) };
+    let slack = ROUNDING * (1.0 + least.abs().max(greatest.abs()));
+    if !(least - slack..=greatest + slack).contains(&value) {
+        return Err(format!(
+            "the return {value} is impossible: with the constants of this world returns are from {least} \
+             to {greatest}. If it was played with others, put a config.toml with [env.WORLD] beside it"
+        ));
+    }
+    if !(1..=horizon).contains(&steps) {
+        return Err(format!(
+            "an episode of {steps} steps is impossible: the time limit is {horizon}"
+        ));
+    }
+    Ok(())
+}
+
+/// Whether a clearance is one.
+fn distance(clearance: Option<f64>) -> Result<(), String> {
+    match clearance {
+        Some(distance) if !(distance.is_finite() && distance >= 0.0) => Err(format!(
+            "the clearance {distance} is no distance; leave the field empty where it is not known"
+        )),
+        _ => Ok(()),
+    }
+}
+
 /// What the types of an evaluation do not promise.
-fn check(evaluation: &Evaluation, name: &RunName) -> Result<(), String> {
+fn check(evaluation: &Evaluation, name: &RunName, limits: Option<Limits>) -> Result<(), String> {
     let (env, eta, seed) = (&evaluation.env, evaluation.eta, evaluation.seed);
     if *env != name.world || eta != name.eta || seed != name.seed {
         return Err(format!("it belongs to {env}/eta-{eta}/seed-{seed}, not into this folder"));
@@ -461,6 +716,8 @@ fn check(evaluation: &Evaluation, name: &RunName) -> Result<(), String> {
         if (mass - 1.0).abs() > 1e-6 {
             return Err(format!("the probabilities of the {kind} sum to {mass}, not 1"));
         }
+        let sound = atoms.iter().try_for_each(|atom| possible(atom.value, atom.steps, limits));
+        sound.and(distance(play.mean_clearance)).map_err(|what| format!("{kind}: {what}"))?;
     }
     Ok(())
 }

@@ -23,7 +23,7 @@
 //! Learning at the Edge of the Statistical Precipice" (NeurIPS 2021), and are checked against its
 //! library rliable and SciPy in `tests/report_statistics.rs`.
 
-use crate::game::returns::{Atom, ReturnLaw};
+use crate::game::returns::{Atom, NORMAL_95, ReturnLaw};
 use lava_envs::random::ChaCha8Rng;
 use rand::RngExt as _;
 use rand_distr::{Binomial, Distribution as _};
@@ -31,9 +31,6 @@ use statrs::distribution::{ContinuousCDF as _, StudentsT};
 
 /// Coverage of every interval.
 pub const LEVEL: f64 = 0.95;
-
-/// Standard normal quantile at (1 + LEVEL) / 2.
-const NORMAL_QUANTILE: f64 = 1.959_963_984_540_054;
 
 /// Recorded episodes that the alpha-tail must hold before its mean is reported.
 pub const TAIL_EPISODES: f64 = 10.0;
@@ -97,7 +94,7 @@ pub fn wilson(successes: f64, trials: f64) -> Option<Interval> {
         return None;
     }
     let rate = successes / trials;
-    let weight = NORMAL_QUANTILE * NORMAL_QUANTILE / trials;
+    let weight = NORMAL_95 * NORMAL_95 / trials;
     let centre = (rate + weight / 2.0) / (1.0 + weight);
     let half = (rate * (1.0 - rate) * weight + weight * weight / 4.0).sqrt() / (1.0 + weight);
     Some(Interval { low: (centre - half).max(0.0), high: (centre + half).min(1.0) })

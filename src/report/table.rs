@@ -10,11 +10,14 @@
 //! interval reaches into its interval.
 
 use super::group::{Group, groups};
-use super::runs::{Run, Runs};
+use super::runs::{Regret, Run, Runs};
+use super::settings::{Settings, Task, listed};
 use super::statistics::{self, Estimate, Interval};
 use crate::experiment::artefacts::{Audit, Chance};
+use crate::experiment::words::{counted, thousands};
 use crate::game::returns::ReturnLaw;
 use crate::learn::policy::Mode;
+use std::collections::BTreeMap;
 
 /// Standard errors below zero at which the slack of the bound is called a leak. Over a hundred runs
 /// chance alone does that once in 300 tables.
@@ -43,12 +46,12 @@ impl Block {
     pub const ALL: [Block; 5] =
         [Block::Returns, Block::Game, Block::Comparison, Block::Cross, Block::Cost];
 
-    /// Its heading in a table.
-    pub fn title(self, table: &Table) -> String {
+    /// Its heading in a table of a world.
+    pub fn title(self, world: &World) -> String {
         match self {
             Block::Returns => "greedy protagonist under nominal chance",
             Block::Game => "against eta = 1, the game, certificates",
-            Block::Comparison => return format!("against {}", table.first),
+            Block::Comparison => return format!("against {}", world.first),
             Block::Cross => "CVaR of the greedy protagonist at every level",
             Block::Cost => "wall-clock time of training",
         }
@@ -118,6 +121,8 @@ pub struct Column {
     pub best: Best,
     /// What it is, in one sentence of the legend.
     pub meaning: &'static str,
+    /// The same for the few lines below a table on a screen; empty where the heading says it.
+    pub brief: &'static str,
     compute: fn(&Group, &Others) -> Cell,
 }
 
@@ -125,7 +130,7 @@ pub struct Column {
 struct Others<'a> {
     /// The row of the same name at eta = 1.
     neutral: Option<&'a Group<'a>>,
-    /// The row of the first name at the same eta, if there are several names.
+    /// The row of the first name at the same eta, if there are several names and the task is the same.
     first: Option<&'a Group<'a>>,
 }
 
@@ -190,6 +195,7 @@ pub static COLUMNS: [Column; 31] = [
         format: Format::Estimate(3),
         best: Best::Highest,
         meaning: "mean return of the greedy protagonist under nominal chance",
+        brief: "",
         compute: |group, _| estimate(group.mean(|measures| measures.mean)),
     },
     Column {
@@ -199,6 +205,7 @@ pub static COLUMNS: [Column; 31] = [
         format: Format::Estimate(3),
         best: Best::HighestOfEta,
         meaning: "mean of the worst 1/eta of its returns: what the row was trained for",
+        brief: "mean of the worst 1/eta of the returns",
         compute: |group, _| cvar(group, group.alpha()),
     },
     Column {
@@ -208,6 +215,7 @@ pub static COLUMNS: [Column; 31] = [
         format: Format::Estimate(3),
         best: Best::Highest,
         meaning: "mean of its worst 50 % of returns",
+        brief: "",
         compute: |group, _| cvar(group, 0.5),
     },
     Column {
@@ -217,6 +225,7 @@ pub static COLUMNS: [Column; 31] = [
         format: Format::Estimate(3),
         best: Best::Highest,
         meaning: "mean of its worst 25 % of returns",
+        brief: "",
         compute: |group, _| cvar(group, 0.25),
     },
     Column {
@@ -226,6 +235,7 @@ pub static COLUMNS: [Column; 31] = [
         format: Format::Estimate(3),
         best: Best::Highest,
         meaning: "mean of its worst 10 % of returns",
+        brief: "",
         compute: |group, _| cvar(group, 0.1),
     },
     Column {
@@ -235,6 +245,7 @@ pub static COLUMNS: [Column; 31] = [
         format: Format::Estimate(3),
         best: Best::Highest,
         meaning: "mean of its worst 5 % of returns",
+        brief: "",
         compute: |group, _| cvar(group, 0.05),
     },
     Column {
@@ -244,6 +255,7 @@ pub static COLUMNS: [Column; 31] = [
         format: Format::Estimate(3),
         best: Best::Highest,
         meaning: "mean of its worst 4 % of returns",
+        brief: "",
         compute: |group, _| cvar(group, 0.04),
     },
     Column {
@@ -253,6 +265,7 @@ pub static COLUMNS: [Column; 31] = [
         format: Format::Estimate(3),
         best: Best::Highest,
         meaning: "mean of its worst 1 % of returns",
+        brief: "",
         compute: |group, _| cvar(group, 0.01),
     },
     Column {
@@ -262,6 +275,7 @@ pub static COLUMNS: [Column; 31] = [
         format: Format::Percent,
         best: Best::Lowest,
         meaning: "share of its episodes that end in lava",
+        brief: "",
         compute: |group, _| estimate(group.rate(|measures| measures.lava)),
     },
     Column {
@@ -271,6 +285,7 @@ pub static COLUMNS: [Column; 31] = [
         format: Format::Percent,
         best: Best::Highest,
         meaning: "share of its episodes that reach the goal; the rest runs into the time limit",
+        brief: "",
         compute: |group, _| estimate(group.rate(|measures| measures.goal)),
     },
     Column {
@@ -280,6 +295,7 @@ pub static COLUMNS: [Column; 31] = [
         format: Format::Estimate(3),
         best: Best::None,
         meaning: "least distance to lava in an episode, on average (lava-grid: cells; lava-point: metres)",
+        brief: "least distance to lava",
         compute: |group, _| estimate(group.mean(|measures| measures.clearance)),
     },
     Column {
@@ -289,6 +305,7 @@ pub static COLUMNS: [Column; 31] = [
         format: Format::Estimate(3),
         best: Best::HighestOfEta,
         meaning: "interquartile mean over seeds of CVaR_1/eta: the middle half of the runs",
+        brief: "CVaR_1/eta of the middle half of the seeds",
         compute: |group, _| {
             // Of three seeds it is the mean once more.
             if group.runs.len() < 4 {
@@ -305,6 +322,7 @@ pub static COLUMNS: [Column; 31] = [
         format: Format::Worst(3),
         best: Best::None,
         meaning: "CVaR_1/eta of the worst seed; a failed run is worse than any number",
+        brief: "its CVaR_1/eta",
         compute: |group, _| {
             let level = group.level(group.alpha());
             let worst = group.worst(|measures| measures.cvar[level]);
@@ -319,6 +337,7 @@ pub static COLUMNS: [Column; 31] = [
         best: Best::None,
         meaning: "CVaR_1/eta minus CVaR at that same level of the eta = 1 policy of the same seed \
                   (positive: better than eta = 1)",
+        brief: "CVaR_1/eta over that of eta = 1",
         compute: |group, others| gain(group, others.neutral),
     },
     Column {
@@ -328,6 +347,7 @@ pub static COLUMNS: [Column; 31] = [
         format: Format::Count,
         best: Best::None,
         meaning: "number of seeds in gain",
+        brief: "",
         compute: |group, others| pairs(group, others.neutral),
     },
     Column {
@@ -337,6 +357,7 @@ pub static COLUMNS: [Column; 31] = [
         format: Format::Estimate(2),
         best: Best::None,
         meaning: "probability that a run of the row beats a run of eta = 1 in CVaR at level 1/eta",
+        brief: "probability that a run beats one that it is compared with",
         compute: |group, others| improvement(group, others.neutral),
     },
     Column {
@@ -346,6 +367,7 @@ pub static COLUMNS: [Column; 31] = [
         format: Format::Estimate(3),
         best: Best::None,
         meaning: "mean return of the sampled protagonist under its learned antagonist (eta = 1: which can do nothing)",
+        brief: "mean return against the learned antagonist",
         compute: |group, _| estimate(group.mean(|measures| measures.game_value)),
     },
     Column {
@@ -355,6 +377,7 @@ pub static COLUMNS: [Column; 31] = [
         format: Format::Estimate(4),
         best: Best::LowestOfEta,
         meaning: "the best possible CVaR_1/eta minus that of the greedy protagonist",
+        brief: "CVaR_1/eta of the optimum, or of the oracle where that is not known, minus that of the row",
         compute: |group, _| estimate(group.mean(|measures| measures.regret)),
     },
     Column {
@@ -365,6 +388,7 @@ pub static COLUMNS: [Column; 31] = [
         best: Best::None,
         meaning: "value of the greedy protagonist under its antagonist minus its CVaR_1/eta: \
                   how far the antagonist is from the worst case (0: perfect)",
+        brief: "0 for a perfect antagonist",
         compute: |group, _| estimate(group.mean(|measures| measures.antagonist_gap)),
     },
     Column {
@@ -374,6 +398,7 @@ pub static COLUMNS: [Column; 31] = [
         format: Format::Percent,
         best: Best::None,
         meaning: "share of its episodes that run into the time limit",
+        brief: "",
         compute: |group, _| estimate(group.rate(|measures| measures.timeout)),
     },
     Column {
@@ -383,6 +408,7 @@ pub static COLUMNS: [Column; 31] = [
         format: Format::Estimate(1),
         best: Best::None,
         meaning: "mean length of its episodes that reach the goal",
+        brief: "",
         compute: |group, _| estimate(group.mean(|measures| measures.steps_to_goal)),
     },
     Column {
@@ -392,6 +418,7 @@ pub static COLUMNS: [Column; 31] = [
         format: Format::Estimate(3),
         best: Best::None,
         meaning: "mean return of the sampled protagonist under nominal chance",
+        brief: "",
         compute: |group, _| estimate(group.mean(|measures| measures.sampled_mean)),
     },
     Column {
@@ -401,6 +428,7 @@ pub static COLUMNS: [Column; 31] = [
         format: Format::Estimate(3),
         best: Best::None,
         meaning: "CVaR_1/eta of the sampled protagonist under nominal chance",
+        brief: "",
         compute: |group, _| estimate(group.mean(|measures| measures.sampled_cvar)),
     },
     Column {
@@ -410,6 +438,7 @@ pub static COLUMNS: [Column; 31] = [
         format: Format::Estimate(3),
         best: Best::None,
         meaning: "game value minus CVaR_1/eta of the sampled protagonist: not below 0, else the budget leaks",
+        brief: "",
         compute: |group, _| estimate(group.mean(|measures| measures.bound_slack)),
     },
     Column {
@@ -419,6 +448,7 @@ pub static COLUMNS: [Column; 31] = [
         format: Format::Count,
         best: Best::None,
         meaning: "steps or trajectories on which an antagonist overran its budget, over all seeds",
+        brief: "",
         compute: |group, _| violations(group).map_or(Cell::Missing, Cell::Count),
     },
     Column {
@@ -428,6 +458,7 @@ pub static COLUMNS: [Column; 31] = [
         format: Format::Estimate(3),
         best: Best::None,
         meaning: "CVaR_1/eta minus that of the first method or folder at the same eta and seed",
+        brief: "CVaR_1/eta over that of the first name",
         compute: |group, others| gain(group, others.first),
     },
     Column {
@@ -437,6 +468,7 @@ pub static COLUMNS: [Column; 31] = [
         format: Format::Count,
         best: Best::None,
         meaning: "number of seeds in difference",
+        brief: "seeds in the difference",
         compute: |group, others| pairs(group, others.first),
     },
     Column {
@@ -446,6 +478,7 @@ pub static COLUMNS: [Column; 31] = [
         format: Format::Estimate(2),
         best: Best::None,
         meaning: "probability that a run of the row beats a run of the first method or folder in CVaR_1/eta",
+        brief: "probability that a run beats one that it is compared with",
         compute: |group, others| improvement(group, others.first),
     },
     Column {
@@ -455,6 +488,7 @@ pub static COLUMNS: [Column; 31] = [
         format: Format::Estimate(0),
         best: Best::None,
         meaning: "environment steps of training, mean over seeds",
+        brief: "",
         compute: |group, _| cost(group, |run| run.steps as f64),
     },
     Column {
@@ -464,6 +498,7 @@ pub static COLUMNS: [Column; 31] = [
         format: Format::Estimate(1),
         best: Best::None,
         meaning: "wall-clock seconds of training, mean over seeds",
+        brief: "",
         compute: |group, _| cost(group, |run| run.seconds),
     },
     Column {
@@ -473,6 +508,7 @@ pub static COLUMNS: [Column; 31] = [
         format: Format::Estimate(0),
         best: Best::None,
         meaning: "environment steps per wall-clock second of training, mean over seeds",
+        brief: "",
         compute: |group, _| cost(group, |run| run.steps as f64 / run.seconds),
     },
 ];
@@ -490,6 +526,10 @@ pub struct Row {
     pub variant: Option<String>,
     /// What tables with several names call it.
     pub name: String,
+    /// What tells its settings apart from others of the method and variant.
+    pub settings: Option<String>,
+    /// Rows of one number have the same task, and their values may be compared.
+    task: usize,
     /// Number of seeds, failed ones included.
     pub seeds: usize,
     /// Number of failed ones.
@@ -505,6 +545,8 @@ pub struct Row {
 pub struct World {
     /// Its name.
     pub name: String,
+    /// The name that the others are compared with.
+    pub first: String,
     /// By eta, then in the order of the names.
     pub rows: Vec<Row>,
     /// How many episodes its numbers rest on.
@@ -546,9 +588,9 @@ impl<'a> Results<'a> {
     fn of_folder(folder: &str, runs: &'a Runs, several: bool) -> Vec<Results<'a>> {
         let mut results: Vec<Results> = Vec::new();
         for group in groups(runs) {
-            if let Some(last) = results.last_mut().filter(|of| of.method() == group.method.as_ref())
-            {
-                last.groups.push(group);
+            let same = |of: &&mut Results| of.method() == group.method.as_ref();
+            if let Some(known) = results.iter_mut().find(same) {
+                known.groups.push(group);
                 continue;
             }
             let (heading, name) = match &group.method {
@@ -578,8 +620,6 @@ impl<'a> Results<'a> {
 pub struct Table {
     /// Heading of the column of names; `None` if there is only one and it goes without saying.
     pub heading: Option<&'static str>,
-    /// The name that the others are compared with.
-    pub first: String,
     /// By name.
     pub worlds: Vec<World>,
     /// What a reader must know before trusting a number: failures, violations, runs left out.
@@ -593,9 +633,15 @@ impl Table {
         let mut names: Vec<&str> = groups().map(|group| group.env).collect();
         names.sort_unstable();
         names.dedup();
-        let worlds = names.iter().map(|name| world(name, results)).collect();
+        let worlds: Vec<World> = names.iter().map(|name| world(name, results)).collect();
         let mut notes: Vec<String> =
             results.iter().flat_map(|results| results.notes.iter().cloned()).collect();
+        for name in &names {
+            let in_world = |of: &&Results| of.groups.iter().any(|group| group.env == *name);
+            let here: Vec<&Results> = results.iter().filter(in_world).collect();
+            notes.extend(comparability(name, &here));
+            notes.extend(without_regret(name, &here));
+        }
         let fewest = groups().map(|group| group.runs.len()).min().unwrap_or_default();
         if fewest == 1 {
             notes.push(
@@ -609,37 +655,47 @@ impl Table {
                  interval, keeps its 95 %."
             ));
         }
-        let first = results.first();
-        let heading = first.and_then(|first| first.heading);
-        Table {
-            heading,
-            first: first.map_or(String::new(), |first| first.name.clone()),
-            worlds,
-            notes,
-        }
+        let heading = results.iter().find_map(|of| of.heading);
+        Table { heading, worlds, notes }
     }
 }
 
 fn world(name: &str, results: &[Results]) -> World {
     let mut rows = Vec::new();
     let mut all: Vec<&Group> = Vec::new();
+    let mut tasks: Vec<&Task> = Vec::new();
+    // The first folder and method, with whatever settings they have here.
+    let named = |of: &Results| {
+        let run = &of.groups[0].runs[0].name;
+        (of.folder.clone(), run.method.clone(), run.variant.clone())
+    };
+    let is_here = |of: &&Results| of.groups.iter().any(|group| group.env == name);
+    let first = results.iter().filter(is_here).find(|of| named(of) == named(&results[0]));
     let find = |results: &'_ Results<'_>, eta: f64| {
         results.groups.iter().position(|group| group.env == name && group.eta == eta)
     };
     for of in results {
         for group in of.groups.iter().filter(|group| group.env == name) {
-            let first = results.first().filter(|_| results.len() > 1);
-            let others = Others {
-                neutral: find(of, 1.0).map(|place| &of.groups[place]),
-                first: first
-                    .and_then(|first| find(first, group.eta).map(|place| &first.groups[place])),
-            };
+            let task = &group.runs[0].settings.task;
+            let place = tasks.iter().position(|known| *known == task);
+            let place = place.unwrap_or_else(|| {
+                tasks.push(task);
+                tasks.len() - 1
+            });
+            let first = first.filter(|_| results.len() > 1);
+            let first = first
+                .and_then(|first| find(first, group.eta).map(|place| &first.groups[place]))
+                .filter(|first| first.runs[0].settings.task == *task);
+            let neutral = find(of, 1.0).map(|place| &of.groups[place]);
+            let others = Others { neutral, first };
             rows.push(Row {
                 eta: group.eta,
                 folder: of.folder.clone(),
                 method: group.runs[0].name.method.clone(),
                 variant: group.runs[0].name.variant.clone(),
                 name: of.name.clone(),
+                settings: group.runs[0].label.clone(),
+                task: place,
                 seeds: group.runs.len(),
                 failures: group.failures(),
                 cells: COLUMNS.iter().map(|column| (column.compute)(group, &others)).collect(),
@@ -651,29 +707,119 @@ fn world(name: &str, results: &[Results]) -> World {
     // Stable: within an eta the names keep their order.
     rows.sort_by(|a, b| a.eta.total_cmp(&b.eta));
     mark(&mut rows);
-    World { name: name.to_owned(), rows, episodes: episodes(&all), checks: checks(&all) }
+    let first = first.map_or(results[0].name.clone(), |first| first.name.clone());
+    World { name: name.to_owned(), first, rows, episodes: episodes(&all), checks: checks(&all) }
 }
 
-/// Marks the best value of each column and what is not distinguishable from it.
+/// What a reader must know before comparing the rows of a world: other tasks, other training (of other
+/// folders; within one it is what the rows are about), other evaluations.
+fn comparability(world: &str, here: &[&Results]) -> Vec<String> {
+    // All runs of a name and world have the same task and training.
+    fn settings<'a>(of: &'a Results, world: &str) -> Option<&'a Settings> {
+        let group = of.groups.iter().find(|group| group.env == world)?;
+        Some(&group.runs[0].settings)
+    }
+    let mut notes = Vec::new();
+    if let Some((first, others)) = here.split_first()
+        && let Some(own) = settings(first, world)
+    {
+        for other in others {
+            let Some(theirs) = settings(other, world) else { continue };
+            let names = format!("{} and {}", first.name, other.name);
+            if own.task != theirs.task {
+                let what = listed(&own.task.differences(&theirs.task));
+                notes.push(format!(
+                    "{world}: {names} are different tasks: {what}. CVaR compares policies of one task, so \
+                     no difference is shown."
+                ));
+            } else if first.folder != other.folder {
+                let differences = own.training_differences(theirs);
+                if !differences.is_empty() {
+                    let what = listed(&differences);
+                    notes.push(format!("{world}: {names} were trained differently: {what}."));
+                }
+            }
+        }
+    }
+    let runs = || {
+        let groups = here.iter().flat_map(|of| &of.groups).filter(|group| group.env == world);
+        groups.flat_map(|group| group.runs)
+    };
+    let mut values: BTreeMap<&String, Vec<(String, u64)>> = BTreeMap::new();
+    for (key, value) in runs().flat_map(|run| run.settings.evaluation()) {
+        let (known, value) = (values.entry(key).or_default(), value.to_string());
+        match known.iter_mut().find(|(of, _)| *of == value) {
+            Some((_, count)) => *count += 1,
+            None => known.push((value, 1)),
+        }
+    }
+    for (key, values) in values.iter().filter(|(_, values)| values.len() > 1) {
+        let said =
+            |(value, count): &(String, u64)| format!("{value} in {}", counted(*count, "run"));
+        let said: Vec<String> = values.iter().map(said).collect();
+        notes.push(format!(
+            "{world}: the runs were evaluated differently: {key} is {}.",
+            said.join(", ")
+        ));
+    }
+    notes
+}
+
+/// Why rows of a world have no regret, and what to do about it.
+fn without_regret(world: &str, here: &[&Results]) -> Vec<String> {
+    let mut found: Vec<(&Regret, Vec<f64>)> = Vec::new();
+    for group in here.iter().flat_map(|of| &of.groups).filter(|group| group.env == world) {
+        let unknown = |regret: &&Regret| matches!(regret, Regret::NotShipped | Regret::Refused(_));
+        for regret in group.runs.iter().map(|run| &run.regret).filter(unknown) {
+            match found.iter_mut().find(|(known, _)| *known == regret) {
+                Some((_, etas)) if etas.contains(&group.eta) => {}
+                Some((_, etas)) => etas.push(group.eta),
+                None => found.push((regret, vec![group.eta])),
+            }
+        }
+    }
+    let said = |(why, etas): &(&Regret, Vec<f64>)| {
+        let why = match why {
+            Regret::Refused(why) => format!("the best CVaR cannot be computed: {why}"),
+            _ => format!(
+                "no certificate of the best CVaR comes with the program for these constants and budgets. \
+                 Runs have it that are trained with --set evaluation.oracle=computed, which takes \
+                 minutes; cvar-game exact --env {world} --eta {} (with the --set of your constants) \
+                 gives the number alone",
+                etas[0]
+            ),
+        };
+        let etas: Vec<String> = etas.iter().map(f64::to_string).collect();
+        format!("{world}, eta = {}: some rows have no regret, because {why}.", etas.join(", "))
+    };
+    found.iter().map(said).collect()
+}
+
+/// Marks, among the rows of each task, the best value of each column and what is not distinguishable from
+/// it.
 fn mark(rows: &mut [Row]) {
-    for (place, column) in COLUMNS.iter().enumerate() {
-        match column.best {
-            Best::None => {}
-            Best::Highest => mark_among(rows, place, 1.0),
-            Best::Lowest => mark_among(rows, place, -1.0),
-            Best::HighestOfEta | Best::LowestOfEta => {
-                let sign = if column.best == Best::HighestOfEta { 1.0 } else { -1.0 };
-                for rows in rows.chunk_by_mut(|a, b| a.eta == b.eta) {
-                    mark_among(rows, place, sign);
+    let tasks = rows.iter().map(|row| row.task + 1).max().unwrap_or_default();
+    for task in 0..tasks {
+        let mut rows: Vec<&mut Row> = rows.iter_mut().filter(|row| row.task == task).collect();
+        for (place, column) in COLUMNS.iter().enumerate() {
+            match column.best {
+                Best::None => {}
+                Best::Highest => mark_among(&mut rows, place, 1.0),
+                Best::Lowest => mark_among(&mut rows, place, -1.0),
+                Best::HighestOfEta | Best::LowestOfEta => {
+                    let sign = if column.best == Best::HighestOfEta { 1.0 } else { -1.0 };
+                    for rows in rows.chunk_by_mut(|a, b| a.eta == b.eta) {
+                        mark_among(rows, place, sign);
+                    }
                 }
             }
         }
     }
 }
 
-fn mark_among(rows: &mut [Row], place: usize, sign: f64) {
+fn mark_among(rows: &mut [&mut Row], place: usize, sign: f64) {
     // The interval, turned so that more is better, with the value in front.
-    let score = |row: &Row| match row.cells[place] {
+    let score = |row: &&mut Row| match row.cells[place] {
         Cell::Estimate(Estimate { value, interval: Some(Interval { low, high }) }) => {
             let (worst, best) = if sign > 0.0 { (low, high) } else { (-high, -low) };
             Some((sign * value, worst, best))
@@ -784,27 +930,4 @@ fn episodes(groups: &[&Group]) -> String {
         Some(format!("{name} {range}{}", said(most)))
     });
     format!("Episodes per run: {}", parts.collect::<Vec<String>>().join(", "))
-}
-
-/// A number of things: `1 run`, `2 runs`.
-fn counted(number: u64, of: &str) -> String {
-    let ending = match (number, of.strip_suffix('y')) {
-        (1, _) => of.to_owned(),
-        (_, Some(stem)) => format!("{stem}ies"),
-        (_, None) => format!("{of}s"),
-    };
-    format!("{} {ending}", thousands(number))
-}
-
-/// A whole number with separators: 100,000.
-fn thousands(number: u64) -> String {
-    let digits = number.to_string();
-    let mut text = String::new();
-    for (place, digit) in digits.chars().enumerate() {
-        if place > 0 && (digits.len() - place).is_multiple_of(3) {
-            text.push(',');
-        }
-        text.push(digit);
-    }
-    text
 }

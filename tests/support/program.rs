@@ -3,9 +3,12 @@
 use assert_cmd::cargo::cargo_bin;
 use std::process::{Command, Output, Stdio};
 
-/// The program with a verb, cut off from the terminal.
+/// The program with a verb, cut off from the terminal. The variable CVAR_GAME_TESTED names another build of
+/// it, to see a test fail on a former version.
 pub fn program(verb: &str) -> Command {
-    let mut command = Command::new(cargo_bin("cvar-game"));
+    let path =
+        std::env::var_os("CVAR_GAME_TESTED").map_or_else(|| cargo_bin("cvar-game"), Into::into);
+    let mut command = Command::new(path);
     command.arg(verb).stdin(Stdio::null());
     command
 }

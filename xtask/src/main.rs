@@ -1,4 +1,4 @@
-//! Chores of the workspace: `cargo xtask torch`, `speed`, `scaling`.
+//! Chores of the workspace: `cargo xtask torch`, `speed`, `scaling`, `oracle`.
 //!
 //! Nothing here is needed to build, test or use the program. `torch` provides libtorch, a C++ library of
 //! 480 MB that cargo cannot fetch, and runs a cargo command with the feature `torch`: it fetches the
@@ -7,6 +7,7 @@
 
 mod cache;
 mod libtorch;
+mod oracle;
 mod scaling;
 mod speed;
 mod tools;
@@ -40,6 +41,9 @@ enum Verb {
     },
     /// Measure what training costs against its sizes; results go to results/speed
     Scaling,
+    /// Compute the oracle of lava-point over noise and control steps, in about 40 minutes; the table goes to
+    /// results/oracle
+    Oracle,
     /// Measure the speed of training and its parts; the table goes to target/speed.md
     Speed {
         /// Passed on to the benchmarks, such as a filter of their names: `rollout`
@@ -68,14 +72,8 @@ fn run(verb: Verb) -> Result<ExitCode> {
             }
             cargo(&repository, &with_feature(command))
         }
-        Verb::Scaling => {
-            let build = ["build", "--release"].map(OsString::from);
-            let code = cargo(&repository, &build)?;
-            if code == ExitCode::SUCCESS {
-                scaling::measure(&repository, &speed::target(&repository))?;
-            }
-            Ok(code)
-        }
+        Verb::Scaling => with_program(&repository, scaling::measure),
+        Verb::Oracle => with_program(&repository, oracle::measure),
         Verb::Speed { passed_on } => {
             let target = speed::target(&repository);
             let start = SystemTime::now();
@@ -89,6 +87,18 @@ fn run(verb: Verb) -> Result<ExitCode> {
             Ok(code)
         }
     }
+}
+
+/// Builds the program, and measures with it.
+fn with_program(
+    repository: &Path,
+    measure: impl FnOnce(&Path, &Path) -> Result<()>,
+) -> Result<ExitCode> {
+    let code = cargo(repository, &["build", "--release"].map(OsString::from))?;
+    if code == ExitCode::SUCCESS {
+        measure(repository, &speed::target(repository))?;
+    }
+    Ok(code)
 }
 
 /// A cargo command with the feature `torch`, which is put after the command's own name: what follows

@@ -1,7 +1,7 @@
 //! Constants of `lava-point`, in metres, seconds and kilograms.
 
 use super::LavaPoint;
-use crate::error::{ConfigError, require};
+use crate::error::{ConfigError, require, require_rewards};
 use crate::world::World;
 use serde::{Deserialize, Serialize};
 
@@ -34,7 +34,7 @@ acceleration = 2.5
 noise = 1.5
 
 # Length of a control step, in s.
-# Range: (0, 10]
+# Range: [0.001, 10]
 control_step = 0.2
 
 # Physics substeps of a control step. Impacts are looked for in each of them.
@@ -46,19 +46,19 @@ substeps = 4
 velocity_retention = 0.5
 
 # What a step costs that ends in neither goal nor lava: it is subtracted. As on the grid.
-# Range: [0, inf)
+# Range: [0, 1000000]
 step_cost = 0.035
 
 # Reward on reaching the goal region, which ends the episode.
-# Range: (-inf, inf)
+# Range: [-1000000, 1000000]
 goal_reward = 1.0
 
 # Reward on touching lava, which ends the episode.
-# Range: (-inf, inf)
+# Range: [-1000000, 1000000]
 lava_reward = -1.0
 
 # Time limit T in control steps. A true end of the episode, as on the grid.
-# Range: [1, 4294967295]
+# Range: [1, 1000000]
 horizon = 40
 
 # The lava, a rectangle inside the arena.
@@ -156,8 +156,20 @@ impl PointConfig {
     /// Checks every value.
     ///
     /// # Errors
-    /// Names the first field that is out of range, its value and the range.
+    /// Names the first field that is out of range, its value and the range. A goal that cannot be reached is
+    /// refused too, though [`LavaPoint`] can be made with it.
     pub fn validate(&self) -> Result<(), ConfigError> {
+        self.check_values()?;
+        if !self.goal_can_be_reached() {
+            let allowed =
+                "the disc must reach it on a way from the start that does not touch the lava";
+            return Err(ConfigError::value("goal", self.goal, allowed));
+        }
+        Ok(())
+    }
+
+    /// Checks what the world needs to work.
+    pub(super) fn check_values(&self) -> Result<(), ConfigError> {
         let [width, height] = self.arena;
         for side in self.arena {
             if !(side > 0.0 && side <= 1000.0) {
@@ -205,20 +217,39 @@ impl PointConfig {
             "in [0, 1000] m/s",
         )?;
         require("noise", self.noise, |sigma| (0.0..=1e3).contains(&sigma), "in [0, 1000] m/s")?;
-        let steps = |tau: f64| tau > 0.0 && tau <= 10.0;
-        require("control_step", self.control_step, steps, "above 0 and at most 10 s")?;
+        let steps = |tau: f64| (1e-3..=10.0).contains(&tau);
+        require("control_step", self.control_step, steps, "in [0.001, 10] s")?;
         if !(1..=1000).contains(&self.substeps) {
             return Err(ConfigError::value("substeps", self.substeps, "from 1 to 1000"));
         }
         let retention = |share: f64| (1e-3..=1.0).contains(&share);
         require("velocity_retention", self.velocity_retention, retention, "in [0.001, 1]")?;
-        require("step_cost", self.step_cost, |cost| cost >= 0.0, "at least 0 (it is subtracted)")?;
-        require("goal_reward", self.goal_reward, |_| true, "a finite number")?;
-        require("lava_reward", self.lava_reward, |_| true, "a finite number")?;
-        if self.horizon == 0 {
-            return Err(ConfigError::value("horizon", self.horizon, "at least 1 step"));
+        require_rewards(self.step_cost, self.goal_reward, self.lava_reward, self.horizon)
+    }
+
+    /// Whether the disc can come to the goal region and touch no lava. The lava is convex: where it does not
+    /// reach from wall to wall, there is a way around it.
+    fn goal_can_be_reached(&self) -> bool {
+        let PointConfig { arena, lava, goal, start, radius, .. } = self;
+        // The farthest points from the lava are corners of what the centre can reach of the goal.
+        let side = |axis: usize| {
+            let (least, most) = (*radius, arena[axis] - radius);
+            [goal.min[axis].max(least), goal.max[axis].min(most)]
+        };
+        let [[left, right], [top, bottom]] = [side(0), side(1)];
+        if left > right || top > bottom {
+            return false;
         }
-        Ok(())
+        let narrow = |gap: f64| gap <= 2.0 * radius;
+        let wall_to_wall =
+            |axis: usize| narrow(lava.min[axis]) && narrow(arena[axis] - lava.max[axis]);
+        let beyond = |point: [f64; 2], axis: usize| point[axis] > lava.max[axis];
+        [[left, top], [right, top], [left, bottom], [right, bottom]].into_iter().any(|corner| {
+            distance(corner, *lava) > *radius
+                && (0..2).all(|axis| {
+                    !wall_to_wall(1 - axis) || beyond(corner, axis) == beyond(*start, axis)
+                })
+        })
     }
 
     /// Length tau / n of a physics substep in s.

@@ -1,7 +1,8 @@
 //! What plays: the controller of the dynamic programme, and scripted yardsticks.
 
-use super::lattice::{Space, cubic};
-use super::sweep::{Rewards, Rings, Utility, actions, sweep};
+use super::lattice::Space;
+use super::sweep::{PLAYED, Rewards, SWEPT, Utility, actions, sweep};
+use crate::exact::watch::Watch;
 use lava_envs::PointConfig;
 use lava_envs::point::Force;
 use lava_envs::random::ChaCha8Rng;
@@ -20,11 +21,8 @@ pub trait Protagonist: Sync {
     ) -> Force;
 }
 
-/// The pushes among which a controller chooses.
-const PLAYED: Rings = &[(1.0, 32), (0.75, 16), (0.5, 12), (0.25, 6), (0.0, 1)];
-
 /// Greedy with respect to W of the dynamic programme: the push with the largest W(x, y, v + A u, t),
-/// linear in position and cubic in velocity.
+/// interpolated as in the programme.
 pub struct Controller {
     space: Space,
     /// W by time, node, vbar_x, vbar_y.
@@ -42,8 +40,14 @@ struct Candidate {
 
 impl Controller {
     /// The controller that maximises a utility on a lattice.
-    pub fn new(space: Space, rewards: &Rewards, utility: Utility, threads: usize) -> Controller {
-        let swept = sweep(&space, rewards, utility, threads, true);
+    pub fn new(
+        space: Space,
+        rewards: &Rewards,
+        utility: Utility,
+        threads: usize,
+        watch: &dyn Watch,
+    ) -> Controller {
+        let swept = sweep(&space, rewards, utility, SWEPT, threads, true, watch);
         let nodes = space.config.acceleration / space.spacing;
         let actions = actions(PLAYED)
             .into_iter()
@@ -110,8 +114,8 @@ impl Protagonist for Controller {
                 let place = [0, 1].map(|axis| centre[axis] + option.change[axis]);
                 let below = place.map(f64::floor);
                 let at = [0, 1].map(|axis| below[axis] as usize - 1 - first[axis]);
-                let wx = cubic(place[0] - below[0]);
-                let wy = cubic(place[1] - below[1]);
+                let wx = (space.weights)(place[0] - below[0]);
+                let wy = (space.weights)(place[1] - below[1]);
                 let mut mean = 0.0;
                 for (p, across) in wx.iter().enumerate() {
                     let row = &window[(at[0] + p) * WINDOW + at[1]..][..4];

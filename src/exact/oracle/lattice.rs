@@ -19,6 +19,15 @@
 //! velocity 0; the axes do not act on each other. Lava and goal are tested along the straight path
 //! of each substep.
 //!
+//! # Little noise
+//! Values are interpolated in velocity by cubics where the noise spans 1.5 nodes or more, and by straight lines
+//! where it spans less; there the programme is a Markov decision process of its own, whose values lie between
+//! the least and the largest return whatever the lattice (Kushner and Dupuis 2001, section 5).
+//!
+//! Positions are interpolated by straight lines where those add little to the noise, and by limited cubics where
+//! they would blur the world ([`Space::blurs`]).
+//!
+//! # Ends
 //! Ends are a discontinuity in v+. Each node of v+ therefore represents its cell: [`Events`] holds
 //! the shares of the cell that end in lava and in the goal.
 
@@ -36,6 +45,15 @@ const SLACK: f64 = 1e-4;
 
 /// Standard deviations of the noise at which its lattice ends.
 const TAILS: f64 = 4.0;
+
+/// Standard deviation of the noise in nodes of the velocity lattice from which on weights that sample its
+/// density have its variance.
+const RESOLVED: f64 = 0.7;
+
+/// Standard deviation of the noise in nodes of the velocity lattice from which on means over the noise are so
+/// smooth that cubics follow them. Below it cubics overshoot, and the maximum over pushes seeks the
+/// overshoot; straight lines stay between the values at the nodes.
+const SMOOTH: f64 = 1.5;
 
 /// Equally spaced nodes of one position axis.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -95,6 +113,8 @@ pub struct Space {
     pub halves: Halves,
     /// Weights of the Gaussian smoothing, of length 2 (plus - mean) + 1, summing to 1.
     pub kernel: Vec<f32>,
+    /// Weights of four nodes for interpolation in velocity.
+    pub weights: fn(f64) -> [f32; 4],
     /// Displacement in s per unit of v+.
     pub reach: f64,
     /// Which end a node itself is, by `x * ny + y`.
@@ -137,24 +157,16 @@ impl Space {
         let (radius, spacing) = (config.radius, lattice.velocity);
         let axes = [0, 1].map(|axis| Axis::new(radius, config.arena[axis] - radius, lattice.cell));
         let halves = Halves::new(config, spacing);
-        let wide = (halves.plus - halves.mean) as i64;
-        let weight = |m: i64| {
-            let z = m as f64 * spacing / config.noise.max(1e-12);
-            if m == 0 { 1.0 } else { (-0.5 * z * z).exp() }
-        };
-        let total: f64 = (-wide..=wide).map(weight).sum();
-        let kernel = (-wide..=wide).map(|m| (weight(m) / total) as f32).collect();
+        let kernel = kernel(config.noise / spacing, halves.plus - halves.mean);
 
-        let substeps = f64::from(config.substeps);
-        let left = config.velocity_retention.powf(1.0 / substeps);
-        let travel: f64 = (0..config.substeps).map(|k| left.powi(k as i32)).sum();
         let mut space = Space {
             config: config.clone(),
             axes,
             spacing,
             halves,
             kernel,
-            reach: config.substep() * travel,
+            weights: if config.noise / spacing < SMOOTH { linear } else { cubic },
+            reach: reach(config),
             stopped: Vec::new(),
             events: Vec::new(),
             landings: [Vec::new(), Vec::new()],
@@ -168,8 +180,8 @@ impl Space {
         space
     }
 
-    /// Bytes that the tables of so many controllers and the work space of a programme would take.
-    pub fn bytes(config: &PointConfig, lattice: &Lattice, tables: usize) -> f64 {
+    /// Bytes that the table of a controller and the work space of its programme would take.
+    pub fn bytes(config: &PointConfig, lattice: &Lattice) -> f64 {
         let nodes = |axis: usize| {
             ((config.arena[axis] - 2.0 * config.radius) / lattice.cell).round().max(1.0) + 1.0
         };
@@ -177,12 +189,26 @@ impl Space {
         let square = |half: usize| (2.0 * half as f64 + 1.0).powi(2);
         let table = f64::from(config.horizon) * square(mean) * 4.0;
         // V of two times in single precision, and the shares of ends in bytes.
-        nodes(0) * nodes(1) * (table * tables as f64 + square(plus) * 9.0)
+        nodes(0) * nodes(1) * (table + square(plus) * 9.0)
     }
 
     /// Number of position nodes.
     pub fn nodes(&self) -> usize {
         self.axes[0].nodes * self.axes[1].nodes
+    }
+
+    /// Whether straight lines between positions would spread the state of an episode, step by step, by more than a
+    /// tenth of what noise does. The position is uniform between two nodes for most steps, and the line then has
+    /// the variance of a sixth of their squared distance.
+    pub fn blurs(&self) -> bool {
+        let widest = self.axes.iter().fold(0.0_f64, |widest, axis| widest.max(axis.step));
+        let (lines, noise) = (widest.powi(2) / 6.0, (self.reach * self.config.noise).powi(2));
+        lines > 0.1 * noise
+    }
+
+    /// Whether the noise is so small for the lattice that returns are a matter of whole steps.
+    pub fn is_coarse(&self) -> bool {
+        self.blurs() || self.config.noise / self.spacing < SMOOTH
     }
 
     /// Position of a node in m.
@@ -253,7 +279,7 @@ impl Space {
                 for dx in &offsets {
                     for dy in &offsets {
                         let velocity = [self.plus(i) + dx, self.plus(j) + dy];
-                        code += match scene.step(&self.config, position, velocity).end {
+                        code += match scene.step(position, velocity).end {
                             Some(End::Lava) => 16,
                             Some(End::Goal) => 1,
                             _ => 0,
@@ -265,6 +291,33 @@ impl Space {
         }
         if events.iter().all(|&code| code == 0) { Vec::new() } else { events }
     }
+}
+
+/// Displacement in s per unit of v+ in free flight.
+fn reach(config: &PointConfig) -> f64 {
+    let left = config.velocity_retention.powf(1.0 / f64::from(config.substeps));
+    let travel: f64 = (0..config.substeps).map(|k| left.powi(k as i32)).sum();
+    config.substep() * travel
+}
+
+/// Weights of the smoothing over noise, for `wide` nodes on either side, whose variance is that of the noise.
+/// `ratio` is its standard deviation in nodes.
+fn kernel(ratio: f64, wide: usize) -> Vec<f32> {
+    let nodes = -(wide as i64)..=wide as i64;
+    let weight = |m: i64| {
+        if ratio >= RESOLVED {
+            (-0.5 * (m as f64 / ratio).powi(2)).exp()
+        } else {
+            // The law on three nodes with the first three moments of the noise.
+            match m {
+                0 => 1.0 - ratio * ratio,
+                -1 | 1 => 0.5 * ratio * ratio,
+                _ => 0.0,
+            }
+        }
+    };
+    let total: f64 = nodes.clone().map(weight).sum();
+    nodes.map(|m| (weight(m) / total) as f32).collect()
 }
 
 /// Shares of lava and goal in a code of [`Events`].
@@ -284,12 +337,20 @@ pub struct Moved {
     pub end: Option<End>,
 }
 
-/// Lava and goal, as the DP sees them.
+/// Lava, goal and walls, as the DP sees them, and how a disc moves among them.
 #[derive(Debug, Clone)]
 pub struct Scene {
     lava: Rectangle,
     goal: Rectangle,
     radius: f64,
+    /// Where the centre may be, by axis.
+    room: [[f64; 2]; 2],
+    substeps: u32,
+    substep: f64,
+    /// Share of the velocity that is left after a substep, and after a control step.
+    left: [f64; 2],
+    /// Displacement in s per unit of v+ in free flight.
+    reach: f64,
 }
 
 impl Scene {
@@ -297,7 +358,17 @@ impl Scene {
     pub fn new(config: &PointConfig) -> Scene {
         let Rectangle { min, max } = config.goal;
         let goal = Rectangle { min: min.map(|c| c + SLACK), max: max.map(|c| c - SLACK) };
-        Scene { lava: config.lava, goal, radius: config.radius - SLACK }
+        let left = config.velocity_retention.powf(1.0 / f64::from(config.substeps));
+        Scene {
+            lava: config.lava,
+            goal,
+            radius: config.radius - SLACK,
+            room: config.arena.map(|side| [config.radius, side - config.radius]),
+            substeps: config.substeps,
+            substep: config.substep(),
+            left: [left, config.velocity_retention],
+            reach: reach(config),
+        }
     }
 
     /// Which end a centre at rest is in.
@@ -317,18 +388,24 @@ impl Scene {
     }
 
     /// One control step from a velocity after the noise.
-    pub fn step(&self, config: &PointConfig, position: [f64; 2], velocity: [f64; 2]) -> Moved {
-        let h = config.substep();
-        let left = config.velocity_retention.powf(1.0 / f64::from(config.substeps));
-        let Moved { mut position, mut velocity, .. } = Moved { position, velocity, end: None };
-        for _ in 0..config.substeps {
+    pub fn step(&self, position: [f64; 2], velocity: [f64; 2]) -> Moved {
+        let stops = |axis: usize, goes_to: f64| {
+            let [low, high] = self.room[axis];
+            goes_to < low - 1e-9 || goes_to > high + 1e-9
+        };
+        // Damping does not turn the velocity: in free flight all substeps together are one straight path.
+        let path = velocity.map(|v| self.reach * v);
+        let free = (0..2).all(|axis| !stops(axis, position[axis] + path[axis]));
+        let (times, length) = if free { (1, self.reach) } else { (self.substeps, self.substep) };
+        let left = self.left[usize::from(free)];
+        let (mut position, mut velocity) = (position, velocity);
+        for _ in 0..times {
             let before = position;
             for axis in 0..2 {
-                let (low, high) = (config.radius, config.arena[axis] - config.radius);
-                let goes_to = position[axis] + h * velocity[axis];
+                let [low, high] = self.room[axis];
+                let goes_to = position[axis] + length * velocity[axis];
                 position[axis] = goes_to.clamp(low, high);
-                let stops = goes_to < low - 1e-9 || goes_to > high + 1e-9;
-                velocity[axis] = if stops { 0.0 } else { velocity[axis] * left };
+                velocity[axis] = if stops(axis, goes_to) { 0.0 } else { velocity[axis] * left };
             }
             let path = [position[0] - before[0], position[1] - before[1]];
             if let Some((time, end)) = self.first_end(before, path) {
@@ -401,6 +478,11 @@ fn time_to_disc(from: [f64; 2], path: [f64; 2], centre: [f64; 2], radius: f64) -
     }
     let time = outside / (-b + root.sqrt());
     (time <= 1.0).then_some(time)
+}
+
+/// Weights of the straight line between nodes 0 and 1 at `share` in [0, 1], as [`cubic`] orders them.
+pub fn linear(share: f64) -> [f32; 4] {
+    [0.0, (1.0 - share) as f32, share as f32, 0.0]
 }
 
 /// Weights of the cubic through four equally spaced nodes -1, 0, 1, 2 at `share` in [0, 1].

@@ -1,6 +1,7 @@
 //! Playing a protagonist in the physical world: this, and not the lattice, is what certifies.
 
 use super::controller::Protagonist;
+use crate::exact::watch::Watch;
 use crate::game::returns::{Atom, ReturnLaw};
 use lava_envs::law::{GaussianLaw, Law};
 use lava_envs::point::Force;
@@ -8,6 +9,7 @@ use lava_envs::random::{Purpose, stream};
 use lava_envs::{ConfigError, LavaPoint, PointConfig, Step, World};
 use nalgebra::Vector2;
 use std::sync::Mutex;
+use std::sync::atomic::{AtomicU64, Ordering};
 
 /// Episodes that are in a world at the same time, and the unit of work of a thread.
 const BATCH: usize = 250;
@@ -24,7 +26,7 @@ pub struct Played {
 }
 
 /// Plays episodes `0..episodes` of a seed under nominal chance. Episode i has its own streams, so the
-/// result depends neither on the number of threads nor on the batch.
+/// result depends neither on the number of threads nor on the batch. `watch` is told the share that is done.
 ///
 /// # Errors
 /// If the configuration is out of range.
@@ -35,6 +37,7 @@ pub fn play(
     episodes: u64,
     seed: u64,
     threads: usize,
+    watch: &dyn Watch,
 ) -> Result<Played, ConfigError> {
     config.validate()?;
     let blank = Episode {
@@ -48,6 +51,8 @@ pub fn play(
         crossing: None,
     };
     let mut records = vec![blank; episodes as usize];
+    let batches = episodes.div_ceil(BATCH as u64);
+    let done = AtomicU64::new(0);
     let queue = Mutex::new(records.chunks_mut(BATCH).enumerate());
     std::thread::scope(|scope| {
         let workers: Vec<_> = (0..threads)
@@ -58,6 +63,8 @@ pub fn play(
                         let Some((batch, records)) = next else { return Ok(()) };
                         let first = (batch * BATCH) as u64;
                         play_batch(config, gamma, protagonist, seed, first, records)?;
+                        let done = done.fetch_add(1, Ordering::Relaxed) + 1;
+                        watch.done(done as f64 / batches as f64);
                     }
                 })
             })

@@ -9,7 +9,7 @@
 //!   V(x, y, v, t)    = max over |u| <= 1 of W(x, y, v + A u, t).
 //!
 //! While an episode runs its accumulated reward is a function of t, so (s, t) suffices as a state.
-//! V is interpolated linearly in position and by cubics in velocity; W is a product of two
+//! V is interpolated linearly in position and as [`super::lattice`] says in velocity; W is a product of two
 //! one-dimensional convolutions on the velocity lattice, which for smooth Q and dv <= sigma/2 is
 //! accurate to many digits; the maximum is over the fixed actions of [`actions`], whose stencils are
 //! the same at every node because the lattices of v and vbar are aligned.
@@ -17,7 +17,8 @@
 //! Work is split by columns of the position lattice, each of which reads the later V and writes its
 //! own part: the result does not depend on the number of threads.
 
-use super::lattice::{Space, cubic, shares};
+use super::lattice::{Halves, Space, cubic, shares};
+use crate::exact::watch::Watch;
 use lava_envs::{End, PointConfig};
 use std::sync::Mutex;
 
@@ -69,8 +70,11 @@ impl Rewards {
 /// Rings of pushes: lengths, and directions on each.
 pub type Rings = &'static [(f64, usize)];
 
-/// The pushes that the DP maximises over.
+/// The pushes that the DP of a controller maximises over.
 pub const SWEPT: Rings = &[(1.0, 16), (0.5, 8), (0.0, 1)];
+
+/// The pushes among which a controller chooses.
+pub const PLAYED: Rings = &[(1.0, 32), (0.75, 16), (0.5, 12), (0.25, 6), (0.0, 1)];
 
 /// Pushes on rings, as vectors u.
 pub fn actions(rings: Rings) -> Vec<[f64; 2]> {
@@ -96,7 +100,7 @@ impl Stencil {
         let below = places.map(f64::floor);
         Stencil {
             offset: below.map(|node| node as i64 - 1),
-            weights: [0, 1].map(|axis| cubic(places[axis] - below[axis])),
+            weights: [0, 1].map(|axis| (space.weights)(places[axis] - below[axis])),
         }
     }
 }
@@ -111,7 +115,7 @@ fn upsampling(space: &Space) -> Vec<(usize, [f32; 4])> {
             let first = (place.floor() as usize).clamp(1, last - 2);
             let share = place - first as f64;
             // Beyond the outer stencils the cubic is continued, as far as the last node.
-            (first - 1, cubic(share))
+            (first - 1, (space.weights)(share))
         })
         .collect()
 }
@@ -125,20 +129,40 @@ pub struct Swept {
     pub value: f64,
 }
 
-/// Runs the programme. `keep` says whether W of all times is kept, as a controller needs it.
+/// Operations that [`sweep`] takes, roughly.
+pub fn cost(space: &Space, pushes: Rings) -> f64 {
+    let count = |half: usize| 2.0 * half as f64 + 1.0;
+    let Halves { before, mean, plus } = space.halves;
+    let (before, mean, plus) = (count(before), count(mean), count(plus));
+    let smoothing = space.kernel.len() as f64 * mean * (plus + mean);
+    let maximum = 8.0 * actions(pushes).len() as f64 * before * before;
+    let moving = 4.0 * plus * (before + 2.0 * plus);
+    f64::from(space.config.horizon) * space.nodes() as f64 * (smoothing + maximum + moving)
+}
+
+/// Runs the programme, which maximises over these pushes. `keep` says whether W of all times is kept, as a controller needs it; `watch` is told
+/// the share that is done.
 pub fn sweep(
     space: &Space,
     rewards: &Rewards,
     utility: Utility,
+    pushes: Rings,
     threads: usize,
     keep: bool,
+    watch: &dyn Watch,
 ) -> Swept {
     let sizes = Sizes::of(space);
     let programme = Programme {
         space,
         sizes,
-        stencils: actions(SWEPT).into_iter().map(|push| Stencil::new(space, push)).collect(),
+        stencils: actions(pushes).into_iter().map(|push| Stencil::new(space, push)).collect(),
         upsampling: upsampling(space),
+        limited: space.blurs(),
+        along_y: if space.blurs() {
+            space.landings[1].iter().map(|landing| cubic(f64::from(landing.share))).collect()
+        } else {
+            Vec::new()
+        },
     };
     let horizon = space.config.horizon as usize;
     let times = if keep { horizon } else { 1 };
@@ -172,6 +196,7 @@ pub fn sweep(
             }
         });
         std::mem::swap(&mut later, &mut now);
+        watch.done((horizon - time) as f64 / horizon as f64);
     }
     let start = space.config.start;
     let [(x, fx), (y, fy)] = [0, 1].map(|axis| space.axes[axis].locate(start[axis]));
@@ -181,6 +206,13 @@ pub fn sweep(
     let low = at(x, y) * (1.0 - fy) + at(x, y + 1) * fy;
     let high = at(x + 1, y) * (1.0 - fy) + at(x + 1, y + 1) * fy;
     Swept { means, value: low * (1.0 - fx) + high * fx }
+}
+
+/// Interpolation that stays between the two middle values, from the weights of a cubic: a cubic where that is
+/// so, and no overshoot beside a border (Bermejo and Staniforth 1992).
+fn limited([a, b, c, d]: [f32; 4], weights: [f32; 4]) -> f32 {
+    let cubic = weights[0] * a + weights[1] * b + weights[2] * c + weights[3] * d;
+    cubic.clamp(b.min(c), b.max(c))
 }
 
 /// Utilities of the ends at one time.
@@ -244,6 +276,10 @@ struct Programme<'a> {
     sizes: Sizes,
     stencils: Vec<Stencil>,
     upsampling: Vec<(usize, [f32; 4])>,
+    /// Whether positions are interpolated by limited cubics.
+    limited: bool,
+    /// Weights of the cubics along y, by node and v+_y; empty without them.
+    along_y: Vec<[f32; 4]>,
 }
 
 impl Programme<'_> {
@@ -287,21 +323,37 @@ impl Programme<'_> {
     /// Q of a column but for the ends, by y, v+_x, v+_y.
     fn outcomes(&self, x: usize, later: &[f32], work: &mut Work) {
         let Sizes { ny, plus, .. } = self.sizes;
+        let nx = self.space.axes[0].nodes;
         let [along_x, along_y] = &self.space.landings;
         let size = ny * plus;
         for i in 0..plus {
             let landing = along_x[x * plus + i];
             let slab = |x: usize| &later[(x * plus + landing.velocity) * size..][..size];
             let (low, high) = (slab(landing.node), slab(landing.node + 1));
-            for ((value, low), high) in work.slab.iter_mut().zip(low).zip(high) {
-                *value = low + landing.share * (high - low);
+            if self.limited && 0 < landing.node && landing.node + 2 < nx {
+                let (before, after) = (slab(landing.node - 1), slab(landing.node + 2));
+                let weights = cubic(f64::from(landing.share));
+                for (k, value) in work.slab.iter_mut().enumerate() {
+                    *value = limited([before[k], low[k], high[k], after[k]], weights);
+                }
+            } else {
+                for ((value, low), high) in work.slab.iter_mut().zip(low).zip(high) {
+                    *value = low + landing.share * (high - low);
+                }
             }
             for y in 0..ny {
                 let outcomes = &mut work.outcomes[(y * plus + i) * plus..][..plus];
-                for (outcome, landing) in outcomes.iter_mut().zip(&along_y[y * plus..][..plus]) {
+                let landings = &along_y[y * plus..][..plus];
+                for (k, (outcome, landing)) in outcomes.iter_mut().zip(landings).enumerate() {
                     let place = landing.node * plus + landing.velocity;
                     let (low, high) = (work.slab[place], work.slab[place + plus]);
-                    *outcome = low + landing.share * (high - low);
+                    *outcome = if self.limited && 0 < landing.node && landing.node + 2 < ny {
+                        let (before, after) =
+                            (work.slab[place - plus], work.slab[place + 2 * plus]);
+                        limited([before, low, high, after], self.along_y[y * plus + k])
+                    } else {
+                        low + landing.share * (high - low)
+                    };
                 }
             }
         }

@@ -6,6 +6,7 @@
 use super::annotated::{OptionInfo, Schema, nested};
 use super::{ConfigError, one_line};
 use crate::experiment::names::{MethodName, WorldName};
+use crate::game::budget::Eta;
 use crate::learn::options::TrainOptions;
 use lava_envs::World;
 use toml::Table;
@@ -25,15 +26,23 @@ pub struct WorldInfo {
     /// Checks constants and returns them in the order of their type, with defaults for absent ones.
     pub check: fn(Table) -> Result<Table, String>,
     /// For each method, what refuses options with which it cannot train here.
-    pub methods: Vec<(&'static str, MethodCheck)>,
+    pub methods: Vec<MethodChecks>,
 }
 
-/// Refuses options of training, and of a method itself, that are each in range and impossible together.
-pub type MethodCheck = fn(&TrainOptions, &Table) -> Result<(), String>;
+/// What refuses options with which a method cannot train in a world, each with the reason.
+#[derive(Debug, Clone, Copy)]
+pub struct MethodChecks {
+    /// Name of the method.
+    pub method: &'static str,
+    /// Options of training, and of the method itself, that are each in range and impossible together.
+    pub options: fn(&TrainOptions, &Table) -> Result<(), String>,
+    /// Options of training that train nothing at a budget.
+    pub schedule: fn(&TrainOptions, Eta) -> Result<(), String>,
+}
 
 impl WorldInfo {
     /// The entry of a world with these methods.
-    pub fn of<W: World>(methods: Vec<(&'static str, MethodCheck)>) -> WorldInfo {
+    pub fn of<W: World>(methods: Vec<MethodChecks>) -> WorldInfo {
         WorldInfo {
             name: W::NAME,
             defaults: W::DEFAULTS,

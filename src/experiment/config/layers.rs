@@ -2,6 +2,7 @@
 
 use super::annotated::Schema;
 use super::keys::{at, leaves, merge, nested};
+use super::of_run::as_experiment;
 use super::{Catalogue, ConfigError, one_line};
 use crate::experiment::names::WorldName;
 use crate::files::read_text;
@@ -77,7 +78,8 @@ pub(super) fn read_files(path: &Path) -> Result<Vec<Layer>, ConfigError> {
     let mut read_paths: Vec<PathBuf> = Vec::new();
     let mut next = Some(path.to_owned());
     while let Some(path) = next {
-        let (origin, mut table) = read(&path)?;
+        let (origin, table) = read(&path)?;
+        let mut table = as_experiment(&path, table)?;
         let extends = |what: String| ConfigError::Extends { origin: origin.clone(), what };
         next = match table.remove("extends") {
             None => None,

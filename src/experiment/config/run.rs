@@ -4,7 +4,7 @@ use super::constants::WorldConstants;
 use super::keys::{self, dotted_leaves};
 use super::layers;
 use super::{
-    Catalogue, CheckpointOptions, ConfigError, EvaluationOptions, conflicts, printed, renamed,
+    Catalogue, CheckpointOptions, ConfigError, EvaluationOptions, conflicts, of_run, printed,
     rules, typed,
 };
 use crate::experiment::artefacts::SCHEMA;
@@ -73,6 +73,14 @@ impl RunConfig {
         }
     }
 
+    /// All that training depends on, as a text: two runs with the same one end with the same weights. The
+    /// evaluation is not in it, because it can be done again.
+    pub fn training_text(&self) -> String {
+        let mut table = Table::try_from(self).expect("a configuration is representable as TOML");
+        table.remove("evaluation");
+        table.to_string()
+    }
+
     /// The text of the run's `config.toml`.
     pub fn to_toml(&self) -> String {
         #[derive(Serialize)]
@@ -111,14 +119,7 @@ impl RunConfig {
         mut table: Table,
         catalogue: &Catalogue,
     ) -> Result<RunConfig, ConfigError> {
-        match table.remove("schema") {
-            Some(Value::Integer(version)) if version == i64::from(SCHEMA) => {}
-            other => {
-                let found = other.map_or("none".to_owned(), |version| version.to_string());
-                return Err(ConfigError::Schema { path: path.to_owned(), found });
-            }
-        }
-        renamed::update(&mut table);
+        of_run::to_present(path, &mut table)?;
         for (key, value) in keys::leaves(&table) {
             check_range(catalogue, &key, &value, origin)?;
         }

@@ -1,8 +1,8 @@
 //! Plays for the figures: what [`super`] describes, collected step by step.
 
 use super::{
-    BINS_PER_METRE, BUDGET_CLASSES, BudgetByTime, CellData, Deviations, FigureData, PlaneData,
-    ShiftMap, StoredEpisode, WorldData,
+    BIN, BUDGET_CLASSES, BudgetByTime, CellData, Deviations, FigureData, MOST_BINS, MOST_CELLS,
+    MOST_STEPS, MOST_TIMES, PlaneData, ShiftMap, StoredEpisode, WorldData,
 };
 use crate::exact::yardstick::Solvable;
 use crate::experiment::artefacts::{Chance, SCHEMA};
@@ -35,10 +35,11 @@ const MOST_LEFT: f64 = 4.0;
 /// # Errors
 /// If the world refuses its constants or cannot be solved.
 pub fn collect<W: Arena + Solvable>(of: &Contestants<'_, W>) -> Result<FigureData, RunError> {
-    let Contestants { run, constants, players } = of;
+    let Contestants { run, constants, players, .. } = of;
     let episodes = run.evaluation.figure_episodes;
-    let scene = W::new(constants, 1)?.scene();
-    let mut nominal = Collector::new(of, Chance::Nominal, None);
+    let world = W::new(constants, 1)?;
+    let (scene, horizon) = (world.scene(), world.horizon());
+    let mut nominal = Collector::new(of, Chance::Nominal, None, horizon);
     // Nominal episodes carry the antagonist's likelihood ratios of what happens.
     let shown = NOMINAL.min(episodes);
     match players.opponent() {
@@ -50,7 +51,7 @@ pub fn collect<W: Arena + Solvable>(of: &Contestants<'_, W>) -> Result<FigureDat
     let mut stored: Vec<StoredEpisode> = nominal.stored().cloned().collect();
     let (mut counts, mut budget) = (None, None);
     if let Some(mut antagonist) = players.opponent() {
-        let mut perturbed = Collector::new(of, Chance::Antagonist, Some(Counts::new(&scene)));
+        let mut perturbed = Collector::new(of, Chance::Antagonist, Counts::new(&scene), horizon);
         let antagonist = antagonist.as_mut();
         of.play_episodes(Mode::Greedy, antagonist, Draw::Perturbed, episodes, &mut perturbed)?;
         stored.extend(perturbed.stored().cloned());
@@ -58,16 +59,28 @@ pub fn collect<W: Arena + Solvable>(of: &Contestants<'_, W>) -> Result<FigureDat
         counts = perturbed.counts;
     }
     let world = if scene.cells {
-        WorldData::Cells(cells(of, counts)?)
+        WorldData::Cells(cells(of, &scene, counts)?)
     } else {
-        WorldData::Plane(plane(&nominal.first, counts))
+        WorldData::Plane(plane(&scene, &nominal.first, counts))
     };
-    Ok(FigureData { schema: SCHEMA, episodes, world, budget, stored })
+    let name = Some(run.id().to_string());
+    Ok(FigureData { schema: SCHEMA, run: name, episodes, world, budget, stored })
+}
+
+/// Side of the bins of a plane.
+fn bin(scene: &Scene) -> f64 {
+    (scene.size[0].max(scene.size[1]) / MOST_BINS).max(BIN)
+}
+
+/// Whether a world of cells is small enough for maps.
+fn has_maps(scene: &Scene) -> bool {
+    scene.size[0] * scene.size[1] <= MOST_CELLS
 }
 
 /// The figure data of a world of cells.
 fn cells<W: Arena + Solvable>(
     of: &Contestants<'_, W>,
+    scene: &Scene,
     counts: Option<Counts>,
 ) -> Result<CellData, RunError> {
     let learned = counts.and_then(|counts| match counts {
@@ -76,6 +89,9 @@ fn cells<W: Arena + Solvable>(
     });
     let mut data =
         CellData { occupancy: Vec::new(), learned, exact: None, exact_budget: Vec::new() };
+    if !has_maps(scene) {
+        return Ok(data);
+    }
     let (yardstick, policy) = (of.yardstick()?, of.table()?);
     let exact = yardstick.as_ref().and_then(|yardstick| yardstick.exact());
     let (Some(exact), Some(policy)) = (exact, &policy) else { return Ok(data) };
@@ -90,14 +106,15 @@ fn cells<W: Arena + Solvable>(
             deviations: expected(&exposure.deviations),
         });
         data.exact_budget = rounded_all(exposure.budget);
+        data.exact_budget.truncate(MOST_TIMES as usize);
     }
     Ok(data)
 }
 
 /// The figure data of a world in the plane.
-fn plane(nominal: &[StoredEpisode], counts: Option<Counts>) -> PlaneData {
+fn plane(scene: &Scene, nominal: &[StoredEpisode], counts: Option<Counts>) -> PlaneData {
     let (bins, mut shifts) = match counts {
-        Some(Counts::Plane { bins, classes }) => (bins, classes),
+        Some(Counts::Plane { bins, classes, .. }) => (bins, classes),
         _ => ([0, 0], Vec::new()),
     };
     for map in &mut shifts {
@@ -107,7 +124,7 @@ fn plane(nominal: &[StoredEpisode], counts: Option<Counts>) -> PlaneData {
         }
     }
     let trajectories = nominal.iter().map(|episode| episode.path.clone()).collect();
-    PlaneData { trajectories, bins, shifts }
+    PlaneData { trajectories, bins, bin: bin(scene), shifts }
 }
 
 /// Four decimals are more than a picture shows.
@@ -128,7 +145,7 @@ enum Counts {
     /// By cell.
     Cells { width: usize, deviations: Deviations },
     /// Sums over the steps that began in each bin, by class of the remaining budget.
-    Plane { bins: [usize; 2], classes: Vec<ShiftMap> },
+    Plane { bins: [usize; 2], bin: f64, classes: Vec<ShiftMap> },
 }
 
 /// What was chosen and what happened in one step.
@@ -139,22 +156,26 @@ struct Recorded<W: World> {
 }
 
 impl Counts {
-    /// All counts are 0.
-    fn new(scene: &Scene) -> Self {
+    /// All counts are 0; `None` for a map that is too large to be seen.
+    fn new(scene: &Scene) -> Option<Self> {
         let [width, height] = scene.size;
         if scene.cells {
+            if !has_maps(scene) {
+                return None;
+            }
             let none = vec![0.0; (width * height) as usize];
             let deviations = Deviations { visits: none.clone(), deviations: none };
-            return Counts::Cells { width: width as usize, deviations };
+            return Some(Counts::Cells { width: width as usize, deviations });
         }
-        let bins = scene.size.map(|side| (side * BINS_PER_METRE).ceil() as usize);
+        let bin = bin(scene);
+        let bins = scene.size.map(|side| ((side / bin).ceil() as usize).max(1));
         let count = bins[0] * bins[1];
         let none = ShiftMap {
             visits: vec![0; count],
             shift: vec![[0.0; 2]; count],
             divergence: vec![0.0; count],
         };
-        Counts::Plane { bins, classes: vec![none; BUDGET_CLASSES] }
+        Some(Counts::Plane { bins, bin, classes: vec![none; BUDGET_CLASSES] })
     }
 
     /// Counts a step that began in `place` with `left` = log eta_t / log eta of the budget.
@@ -167,10 +188,9 @@ impl Counts {
                     deviations.deviations[cell] += 1.0;
                 }
             }
-            Counts::Plane { bins, classes } => {
-                let [x, y]: [usize; 2] = std::array::from_fn(|axis| {
-                    ((place[axis] * BINS_PER_METRE) as usize).min(bins[axis] - 1)
-                });
+            Counts::Plane { bins, bin, classes } => {
+                let [x, y]: [usize; 2] =
+                    std::array::from_fn(|axis| ((place[axis] / *bin) as usize).min(bins[axis] - 1));
                 let bin = y * bins[0] + x;
                 let class = ((left * BUDGET_CLASSES as f64) as usize).min(BUDGET_CLASSES - 1);
                 let map = &mut classes[class];
@@ -191,8 +211,12 @@ struct Collector {
     scale: f64,
     counts: Option<Counts>,
     budgets: Budgets,
-    /// The episode in each slot.
+    /// Steps between the places of a thinned trajectory.
+    stride: usize,
+    /// The episode in each slot, up to [`MOST_STEPS`] steps.
     running: Vec<StoredEpisode>,
+    /// Where each slot is, and its time.
+    now: Vec<([f64; 2], usize)>,
     /// The first episodes, by index.
     first: Vec<StoredEpisode>,
     /// The first of the others that end in lava, by index.
@@ -200,21 +224,29 @@ struct Collector {
 }
 
 impl Collector {
-    fn new<W: World>(of: &Contestants<'_, W>, chance: Chance, counts: Option<Counts>) -> Self {
+    fn new<W: World>(
+        of: &Contestants<'_, W>,
+        chance: Chance,
+        counts: Option<Counts>,
+        horizon: u32,
+    ) -> Self {
         let eta = of.run.eta;
         Collector {
             chance,
             scale: if eta.is_neutral() { 0.0 } else { 1.0 / eta.get().ln() },
             counts,
-            budgets: Budgets::default(),
+            budgets: Budgets { every: horizon.div_ceil(MOST_TIMES), ..Budgets::default() },
+            stride: (horizon as usize).div_ceil(MOST_STEPS),
             running: Vec::new(),
+            now: Vec::new(),
             first: Vec::new(),
             lava: Vec::new(),
         }
     }
 
     fn stored(&self) -> impl Iterator<Item = &StoredEpisode> {
-        self.first.iter().take(STORED).chain(&self.lava)
+        let whole = |of: &&StoredEpisode| of.path.len() == of.actions.len() + 1;
+        self.first.iter().take(STORED).chain(&self.lava).filter(whole)
     }
 
     /// Keeps the episode that has ended in the slot, if it is one to be stored.
@@ -248,7 +280,9 @@ impl<W: World> Watcher<W> for Collector {
                 budgets: Vec::new(),
             };
             self.running.resize(slot + 1, none);
+            self.now.resize(slot + 1, Default::default());
         }
+        self.now[slot] = (world.position(slot).map(rounded), world.time(slot) as usize);
         let episode = &mut self.running[slot];
         if world.time(slot) == 0 {
             episode.path.clear();
@@ -256,12 +290,12 @@ impl<W: World> Watcher<W> for Collector {
             episode.outcomes.clear();
             episode.ratios.clear();
             episode.budgets.clear();
-            episode.path.push(world.position(slot).map(rounded));
+            episode.path.push(self.now[slot].0);
         }
     }
 
     fn after(&mut self, game: &VectorGame<W>, slot: usize, index: usize, so_far: &ReturnSoFar) {
-        let time = self.running[slot].actions.len();
+        let (place, time) = self.now[slot];
         let step = game.steps[slot];
         let recorded = Recorded::<W> {
             action: game.actions[slot],
@@ -269,18 +303,25 @@ impl<W: World> Watcher<W> for Collector {
             ratio: game.ratios[slot],
         };
         let before = game.budgets_before[slot].get();
-        if let Some(counts) = &mut self.counts {
-            let left = (before.ln() * self.scale).min(MOST_LEFT);
+        let left = (before.ln() * self.scale).min(MOST_LEFT);
+        if self.chance == Chance::Antagonist {
             self.budgets.add(time, left);
-            counts.add(self.running[slot].path[time], left, &recorded);
+        }
+        if let Some(counts) = &mut self.counts {
+            counts.add(place, left, &recorded);
         }
         let episode = &mut self.running[slot];
         episode.index = index as u64;
-        episode.path.push(game.world.position(slot).map(rounded));
-        episode.actions.push(W::action_arrow(recorded.action).map(rounded));
-        episode.outcomes.push(W::outcome_arrow(recorded.outcome).map(rounded));
-        episode.ratios.push(significant(recorded.ratio));
-        episode.budgets.push(significant(before));
+        let whole = time < MOST_STEPS;
+        if whole || time.is_multiple_of(self.stride) || step.end.is_some() {
+            episode.path.push(game.world.position(slot).map(rounded));
+        }
+        if whole {
+            episode.actions.push(W::action_arrow(recorded.action).map(rounded));
+            episode.outcomes.push(W::outcome_arrow(recorded.outcome).map(rounded));
+            episode.ratios.push(significant(recorded.ratio));
+            episode.budgets.push(significant(before));
+        }
         if let Some(end) = step.end {
             episode.end = end;
             episode.value = rounded(so_far.value);
@@ -293,12 +334,18 @@ impl<W: World> Watcher<W> for Collector {
 /// log eta_t / log eta by time, as sums and histograms.
 #[derive(Default)]
 struct Budgets {
+    /// Steps from one recorded time to the next.
+    every: u32,
     sums: Vec<f64>,
     histograms: Vec<Vec<u64>>,
 }
 
 impl Budgets {
     fn add(&mut self, time: usize, left: f64) {
+        if !time.is_multiple_of(self.every as usize) {
+            return;
+        }
+        let time = time / self.every as usize;
         if self.sums.len() <= time {
             self.sums.resize(time + 1, 0.0);
             self.histograms.resize(time + 1, Vec::new());
@@ -313,7 +360,13 @@ impl Budgets {
     }
 
     fn summary(&self) -> BudgetByTime {
-        let mut summary = BudgetByTime::default();
+        let mut summary = BudgetByTime {
+            every: self.every,
+            running: Vec::new(),
+            mean: Vec::new(),
+            low: Vec::new(),
+            high: Vec::new(),
+        };
         for (sum, histogram) in self.sums.iter().zip(&self.histograms) {
             let running: u64 = histogram.iter().sum();
             let quantile = |share: f64| {

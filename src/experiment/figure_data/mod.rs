@@ -8,8 +8,9 @@
 //! | [`BudgetByTime`] | how the antagonist spends its budget |
 //! | [`StoredEpisode`] | whole episodes, step by step |
 //!
-//! The file is an addition to a run: a run without it is reported as well. Former versions
-//! called it `exhibits.json`.
+//! The file is an addition to a run: a run without it is reported as well. It stays below a few megabytes,
+//! whatever the world: maps have at most [`MOST_CELLS`] cells or [`MOST_BINS`] bins along a side, and long
+//! episodes are thinned. Former versions called it `exhibits.json`.
 
 mod collect;
 
@@ -25,8 +26,20 @@ use super::artefacts::Chance;
 use lava_envs::End;
 use serde::{Deserialize, Serialize};
 
-/// Bins per unit of length of the maps over a plane.
-pub const BINS_PER_METRE: f64 = 2.0;
+/// Side in m of the bins of maps over a plane, where the plane is not too large for it.
+pub const BIN: f64 = 0.5;
+
+/// Most bins along a side of a plane: those of a larger plane are wider.
+pub const MOST_BINS: f64 = 100.0;
+
+/// Most cells of a map: a world with more of them has none.
+pub const MOST_CELLS: f64 = 10_000.0;
+
+/// Most steps of a stored episode. Longer ones are not stored, and their trajectories are thinned.
+pub const MOST_STEPS: usize = 2_000;
+
+/// Most times at which the remaining budget is recorded.
+pub const MOST_TIMES: u32 = 1_000;
 
 /// Classes of the remaining budget: equal parts of log eta_t / log eta in [0, 1], the last one open
 /// above.
@@ -37,6 +50,9 @@ pub const BUDGET_CLASSES: usize = 3;
 pub struct FigureData {
     /// Version of the on-disk formats.
     pub schema: u32,
+    /// The name of the run; former versions did not write it.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub run: Option<String>,
     /// Trajectories that counts and averages are of.
     pub episodes: u64,
     /// Those that only this world has.
@@ -68,6 +84,8 @@ impl FigureData {
                         .all(|length| Some(length) == bins)
                 };
                 bins.is_some()
+                    && point.bin.is_finite()
+                    && point.bin > 0.0
                     && (point.shifts.is_empty() || point.shifts.len() == BUDGET_CLASSES)
                     && point.shifts.iter().all(whole)
             }
@@ -130,9 +148,17 @@ pub struct PlaneData {
     pub trajectories: Vec<Vec<[f64; 2]>>,
     /// Bins along x and y.
     pub bins: [usize; 2],
+    /// Side of a bin in m.
+    #[serde(default = "bin")]
+    pub bin: f64,
     /// How the antagonist shifts chance, by class of the remaining budget from the least on; empty at
     /// eta = 1.
     pub shifts: Vec<ShiftMap>,
+}
+
+/// The bins of former versions.
+fn bin() -> f64 {
+    BIN
 }
 
 /// Per bin, row by row, averaged over the steps that began in it under the learned antagonist.
@@ -147,8 +173,11 @@ pub struct ShiftMap {
 }
 
 /// log eta_t / log eta by time, of the episodes that still run at that time.
-#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct BudgetByTime {
+    /// Steps from one entry to the next; the first one is of time 0.
+    #[serde(default = "each")]
+    pub every: u32,
     /// Their number.
     pub running: Vec<u64>,
     /// Mean.
@@ -157,6 +186,11 @@ pub struct BudgetByTime {
     pub low: Vec<f64>,
     /// 90 % quantile.
     pub high: Vec<f64>,
+}
+
+/// Every step, as in former versions.
+fn each() -> u32 {
+    1
 }
 
 /// One episode of n steps.

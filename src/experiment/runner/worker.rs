@@ -2,16 +2,17 @@
 //! numbers do not depend on how many run at once.
 //!
 //! A worker reads the `config.toml` of its folder and reports on standard output, one JSON object a
-//! line: `{"steps":..,"mean_return":..}`, `{"note":".."}`, or `{"failure":".."}` before it fails.
+//! line: `{"steps":..,"mean_return":..}` in training, `{"evaluated":{"episodes":..,"of":..}}` in the
+//! evaluation, `{"note":".."}`, or `{"failure":".."}` before it fails.
 //! Its standard input is empty. It closes when the parent stops the worker, or when the parent ends for
 //! whatever reason; the worker then writes a checkpoint and ends.
 
-use super::{Failure, LOG, Launcher, Report, Stop, Tick};
+use super::{Evaluated, Failure, LOG, Launcher, Report, Stop, Tick};
 use crate::experiment::config::{Catalogue, RunConfig};
 use crate::experiment::stop::{RESUME, exit_code};
+use crate::files::{create, read_text};
 use serde::{Deserialize, Serialize};
 use signal_hook::consts::SIGTERM;
-use std::fs::File;
 use std::io::{self, BufRead, BufReader, Read, Write};
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, ExitStatus, Stdio};
@@ -23,6 +24,7 @@ use std::time::{Duration, Instant};
 #[serde(untagged)]
 enum Line {
     Tick(Tick),
+    Evaluated { evaluated: Evaluated },
     Note { note: String },
     Failure { failure: String },
 }
@@ -31,6 +33,7 @@ impl From<Report> for Line {
     fn from(report: Report) -> Self {
         match report {
             Report::Tick(tick) => Line::Tick(tick),
+            Report::Evaluated(evaluated) => Line::Evaluated { evaluated },
             Report::Note(note) => Line::Note { note },
         }
     }
@@ -73,7 +76,7 @@ impl Workers {
             .envs([("OMP_NUM_THREADS", "1"), ("MKL_NUM_THREADS", "1")])
             .stdin(Stdio::piped())
             .stdout(Stdio::piped())
-            .stderr(File::create(folder.join(LOG))?);
+            .stderr(create(&folder.join(LOG))?);
         // A group of its own: Ctrl-C on the terminal reaches only the parent, which then stops its
         // workers; a worker that the signal ended would look like a failed run.
         #[cfg(unix)]
@@ -118,6 +121,7 @@ impl Launcher for Workers {
             match lines.recv_timeout(Duration::from_millis(50)) {
                 Ok(line) => match serde_json::from_str(&line) {
                     Ok(Line::Tick(tick)) => report(Report::Tick(tick)),
+                    Ok(Line::Evaluated { evaluated }) => report(Report::Evaluated(evaluated)),
                     Ok(Line::Note { note }) => report(Report::Note(note)),
                     Ok(Line::Failure { failure }) => told = Some(failure),
                     Err(_) => {} // a library that prints
@@ -127,7 +131,7 @@ impl Launcher for Workers {
             }
         }
         let status = worker.wait().map_err(failed)?;
-        let log = std::fs::read_to_string(folder.join(LOG)).unwrap_or_default();
+        let log = read_text(&folder.join(LOG)).unwrap_or_default();
         if log.trim().is_empty() {
             let _ = std::fs::remove_file(folder.join(LOG));
         }
@@ -155,14 +159,7 @@ fn describe(status: ExitStatus, log: &str, folder: &Path) -> String {
 
 /// The main function of a worker process: carries out the run in `folder` and reports on standard output.
 /// Returns its exit code.
-pub fn work(catalogue: &Catalogue, folder: &Path, carry_out: &CarryOut<'_>) -> u8 {
-    let stop = match Stop::on_signals() {
-        Ok(stop) => stop,
-        Err(error) => {
-            eprintln!("cannot listen to signals: {error}");
-            return 1;
-        }
-    };
+pub fn work(catalogue: &Catalogue, folder: &Path, stop: &Stop, carry_out: &CarryOut<'_>) -> u8 {
     let request = stop.clone();
     std::thread::spawn(move || {
         let _ = io::stdin().read_to_end(&mut Vec::new());
@@ -176,7 +173,7 @@ pub fn work(catalogue: &Catalogue, folder: &Path, carry_out: &CarryOut<'_>) -> u
     };
     let result = RunConfig::load(&folder.join("config.toml"), catalogue)
         .map_err(|error| Failure::Failed(error.to_string()))
-        .and_then(|run| carry_out(&run, folder, &stop, &mut |report| say(&report.into())));
+        .and_then(|run| carry_out(&run, folder, stop, &mut |report| say(&report.into())));
     match result {
         Ok(()) => 0,
         Err(Failure::Unfinished) => stop.signal().map_or(RESUME, exit_code),

@@ -6,7 +6,7 @@ use crate::learn::family;
 use crate::learn::method::{
     Arena, Method, Metric, Players, Progress, Setting, TrainError, Training,
 };
-use crate::learn::options::{Adversary, Credit, PlayerOptions, Role, TrainOptions};
+use crate::learn::options::{Adversary, Credit, MOST_UPDATES, PlayerOptions, Role, TrainOptions};
 use crate::learn::pair::Pair;
 use crate::learn::policy::Mode;
 use crate::learn::ppo::{Losses, Rates};
@@ -25,6 +25,7 @@ impl Method for Game {
     const METRICS: &'static [Metric] = &[
         Metric { column: "budget", tag: "charts/budget" },
         Metric { column: "mean_return", tag: "charts/episodic_return" },
+        Metric { column: "mean_length", tag: "charts/episodic_length" },
         Metric { column: "goal", tag: "charts/goal" },
         Metric { column: "lava", tag: "charts/lava" },
         Metric { column: "learning_rate", tag: "charts/learning_rate" },
@@ -47,6 +48,34 @@ impl Method for Game {
             ));
         }
         family::family::<W::Law>(&options.family).map(|_| ())
+    }
+
+    fn check_schedule(options: &TrainOptions, eta: Eta) -> Result<(), String> {
+        let updates = options.updates();
+        let trains =
+            |updates: u64| roles(options, eta, updates).any(|(role, _)| role == Role::Protagonist);
+        if trains(updates) {
+            return Ok(());
+        }
+        // More updates never train it less.
+        let (mut too_few, mut enough) = (updates, MOST_UPDATES);
+        if !trains(enough) {
+            return Err(format!(
+                "at eta = {eta} the protagonist is never updated: all updates are the antagonist's \
+                 response, train.response = {}; lower it",
+                options.response
+            ));
+        }
+        while enough - too_few > 1 {
+            let middle = too_few + (enough - too_few) / 2;
+            *(if trains(middle) { &mut enough } else { &mut too_few }) = middle;
+        }
+        let (steps, update) = (options.steps, options.rollout());
+        Err(format!(
+            "with train.steps = {steps} the protagonist is never updated at eta = {eta}: an update takes \
+             {update} steps, and the antagonist is updated first; use at least {}",
+            enough * update
+        ))
     }
 
     fn begin<'a, W: Arena>(world: W, setting: &'a Setting<'a>) -> Box<dyn Training<W> + 'a> {
@@ -160,6 +189,7 @@ impl<W: Arena> Training<W> for GameTraining<'_, W> {
         let values = vec![
             turn.budget.get(),
             mean_return,
+            collector.mean_length(),
             collector.share(End::Goal),
             collector.share(End::Lava),
             turn.rates.learning_rate,
@@ -218,24 +248,8 @@ pub struct Turn {
 /// adversary does not learn, every turn is the protagonist's; at the end those of the response to its greedy policy are the
 /// antagonist's. Each player's rates fall linearly over its own turns.
 pub fn schedule(options: &TrainOptions, eta: Eta) -> Vec<Turn> {
-    let updates = options.steps.div_ceil(options.rollout());
-    let round = u64::from(options.follower_updates) + 1;
-    let responds = |update: u64| (updates - update) as f64 <= options.response * updates as f64;
-    let mut played = 0; // turns at a budget above 1
-    let roles: Vec<(Role, Eta)> = (0..updates)
-        .map(|update| {
-            let budget = budget_at(options, eta, update as f64 / updates as f64);
-            if budget.is_neutral() || options.adversary == Adversary::Random {
-                return (Role::Protagonist, budget);
-            }
-            if responds(update) {
-                return (Role::Antagonist, budget);
-            }
-            played += 1;
-            let leads = played % round == 0;
-            (if leads { options.leader } else { options.leader.other() }, budget)
-        })
-        .collect();
+    let updates = options.updates();
+    let roles: Vec<(Role, Eta)> = roles(options, eta, updates).collect();
     let count = |wanted: Role| roles.iter().filter(|(role, _)| *role == wanted).count();
     let totals = [Role::Protagonist, Role::Antagonist].map(count);
     let mut done = [0usize; 2];
@@ -251,11 +265,34 @@ pub fn schedule(options: &TrainOptions, eta: Eta) -> Vec<Turn> {
             learning_rate: between(player.learning_rate, player.learning_rate_final),
             entropy: between(player.entropy, player.entropy_final),
         };
-        let response = role == Role::Antagonist && responds(update as u64);
+        let response = role == Role::Antagonist && is_response(options, update as u64, updates);
         let mode = if response { Mode::Greedy } else { Mode::Sampled };
         Turn { update: update as u64 + 1, role, budget, mode, rates }
     };
     roles.iter().enumerate().map(turn).collect()
+}
+
+/// Whose turn each of so many updates is, and at which budget.
+fn roles(options: &TrainOptions, eta: Eta, updates: u64) -> impl Iterator<Item = (Role, Eta)> + '_ {
+    let round = u64::from(options.follower_updates) + 1;
+    let mut played = 0; // turns at a budget above 1
+    (0..updates).map(move |update| {
+        let budget = budget_at(options, eta, update as f64 / updates as f64);
+        if budget.is_neutral() || options.adversary == Adversary::Random {
+            return (Role::Protagonist, budget);
+        }
+        if is_response(options, update, updates) {
+            return (Role::Antagonist, budget);
+        }
+        played += 1;
+        let leads = played % round == 0;
+        (if leads { options.leader } else { options.leader.other() }, budget)
+    })
+}
+
+/// Whether an update is one of the antagonist's response at the end of the run.
+fn is_response(options: &TrainOptions, update: u64, updates: u64) -> bool {
+    (updates - update) as f64 <= options.response * updates as f64
 }
 
 /// The budget at a point of the run in [0, 1): 1 for `budget_wait`, then rising linearly in log eta

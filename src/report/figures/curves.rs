@@ -129,7 +129,12 @@ pub(super) fn regret(panels: &[Panel]) -> Option<(Picture, String)> {
 }
 
 pub(super) fn budget(panels: &[Panel]) -> Option<(Picture, String)> {
-    let by_time = |values: &[f64]| (0..).map(f64::from).zip(values.iter().copied()).collect();
+    let by_time = |every: u32, values: &[f64]| {
+        (0..)
+            .map(|place: u32| f64::from(place) * f64::from(every))
+            .zip(values.iter().copied())
+            .collect()
+    };
     let mut found = Vec::new();
     let mut exact = Vec::new();
     for panel in panels {
@@ -137,7 +142,7 @@ pub(super) fn budget(panels: &[Panel]) -> Option<(Picture, String)> {
             panel.seeds.iter().filter_map(|(_, records)| records.figure_data.as_ref()).collect();
         let mean = |of: fn(&BudgetByTime) -> &Vec<f64>| {
             let budgets = seeds.iter().filter_map(|data| data.budget.as_ref());
-            over_seeds(&budgets.map(|budget| by_time(of(budget))).collect::<Vec<_>>())
+            over_seeds(&budgets.map(|budget| by_time(budget.every, of(budget))).collect::<Vec<_>>())
         };
         let (low, high) = (mean(|of| &of.low), mean(|of| &of.high));
         found.push(
@@ -146,7 +151,7 @@ pub(super) fn budget(panels: &[Panel]) -> Option<(Picture, String)> {
                 .collect(),
         );
         let budgets = seeds.iter().filter_map(|data| match &data.world {
-            WorldData::Cells(cells) => Some(by_time(&cells.exact_budget)),
+            WorldData::Cells(cells) => Some(by_time(1, &cells.exact_budget)),
             WorldData::Plane(_) => None,
         });
         let bands = over_seeds(&budgets.collect::<Vec<_>>());

@@ -7,22 +7,22 @@ use super::canvas::{
     short, text,
 };
 use crate::experiment::figure_data::{
-    BINS_PER_METRE, BUDGET_CLASSES, CellData, Deviations, PlaneData, ShiftMap, WorldData,
+    BUDGET_CLASSES, CellData, Deviations, MOST_CELLS, PlaneData, ShiftMap, WorldData,
 };
 use lava_envs::scene::{Area as Place, AreaKind, Scene};
 use plotters::prelude::*;
 use plotters::style::text_anchor::{HPos, VPos};
 
-/// Units of the canvas per cell or metre.
+/// Units of the canvas per cell, and per metre of a plane that is not large.
 const UNIT: f64 = 44.0;
+/// Units of the canvas of the longer side of a large plane.
+const LARGEST: f64 = 2_000.0;
 /// Space left of and above a map.
 const MARGIN: (i32, i32) = (24, 60);
 /// Height of the strip with the colours' scale.
 const STRIP: i32 = 70;
 
-/// Larger maps are not drawn.
-const MOST_CELLS: f64 = 10_000.0;
-/// Nor are planes with a longer side.
+/// Planes with a longer side are not drawn.
 const LONGEST_SIDE: f64 = 1_000.0;
 
 /// With fewer steps in a cell, a probability is not shown (the paper's threshold).
@@ -35,8 +35,18 @@ struct Layout {
     columns: usize,
     rows: usize,
     extent: (f64, f64),
+    /// Units of the canvas per cell or metre.
+    unit: f64,
     /// Height of the strip below them.
     strip: i32,
+}
+
+/// The corner of a map on the canvas.
+#[derive(Clone, Copy)]
+struct Origin {
+    x: i32,
+    y: i32,
+    unit: f64,
 }
 
 /// The column and the row of each panel: those of one method are beside each other.
@@ -59,13 +69,16 @@ fn places<'a>(panels: impl Iterator<Item = &'a Panel<'a>>) -> Vec<(usize, usize)
 fn layout(scene: &Scene, places: &[(usize, usize)], rows: usize) -> Layout {
     let columns = places.iter().map(|(column, _)| column + 1).max().unwrap_or(1);
     let blocks = places.iter().map(|(_, row)| row + 1).max().unwrap_or(1);
-    Layout { columns, rows: blocks * rows, extent: scene.size.into(), strip: STRIP }
+    let longest = scene.size[0].max(scene.size[1]);
+    let unit = if scene.cells { UNIT } else { UNIT.min(LARGEST / longest) };
+    Layout { columns, rows: blocks * rows, extent: scene.size.into(), unit, strip: STRIP }
 }
 
 impl Layout {
     fn pitch(&self) -> (i32, i32) {
         let (width, height) = self.extent;
-        ((width * UNIT) as i32 + 2 * MARGIN.0, (height * UNIT) as i32 + MARGIN.1 + 16)
+        let unit = self.unit;
+        ((width * unit) as i32 + 2 * MARGIN.0, (height * unit) as i32 + MARGIN.1 + 16)
     }
 
     fn size(&self) -> (u32, u32) {
@@ -73,16 +86,17 @@ impl Layout {
         ((width * self.columns as i32) as u32, (height * self.rows as i32 + self.strip) as u32)
     }
 
-    fn origin(&self, column: usize, row: usize) -> (i32, i32) {
+    fn origin(&self, column: usize, row: usize) -> Origin {
         let (width, height) = self.pitch();
-        (width * column as i32 + MARGIN.0, height * row as i32 + MARGIN.1)
+        let (x, y) = (width * column as i32 + MARGIN.0, height * row as i32 + MARGIN.1);
+        Origin { x, y, unit: self.unit }
     }
 }
 
 /// A place in a map, or far outside of it.
-fn at(origin: (i32, i32), x: f64, y: f64) -> (i32, i32) {
-    let units = |length: f64| (length * UNIT).round().clamp(-1e6, 1e6) as i32;
-    (origin.0 + units(x), origin.1 + units(y))
+fn at(origin: Origin, x: f64, y: f64) -> (i32, i32) {
+    let units = |length: f64| (length * origin.unit).round().clamp(-1e6, 1e6) as i32;
+    (origin.x + units(x), origin.y + units(y))
 }
 
 /// A scene of cells.
@@ -124,13 +138,13 @@ impl Grid {
     }
 }
 
-fn title(canvas: &Area, origin: (i32, i32), words: &str, colour: RGBColor) -> Drawn {
+fn title(canvas: &Area, origin: Origin, words: &str, colour: RGBColor) -> Drawn {
     let style = text(TEXT, colour, HPos::Left, VPos::Bottom);
-    canvas.draw(&Text::new(words.to_owned(), (origin.0, origin.1 - 10), style))
+    canvas.draw(&Text::new(words.to_owned(), (origin.x, origin.y - 10), style))
 }
 
 /// Lava, goal, walls and the lines between cells, over whatever the cells show.
-fn cells(canvas: &Area, grid: &Grid, origin: (i32, i32)) -> Drawn {
+fn cells(canvas: &Area, grid: &Grid, origin: Origin) -> Drawn {
     for (cell, kind) in grid.kinds.iter().enumerate() {
         let (x, y) = grid.corner(cell);
         let corners = [at(origin, x, y), at(origin, x + 1.0, y + 1.0)];
@@ -143,7 +157,7 @@ fn cells(canvas: &Area, grid: &Grid, origin: (i32, i32)) -> Drawn {
         }
         canvas.draw(&frame(corners, FAINT.stroke_width(1)))?;
     }
-    let corners = [origin, at(origin, grid.width as f64, grid.height as f64)];
+    let corners = [at(origin, 0.0, 0.0), at(origin, grid.width as f64, grid.height as f64)];
     canvas.draw(&frame(corners, INK.stroke_width(3)))
 }
 
@@ -159,7 +173,7 @@ fn fill(kind: AreaKind) -> RGBColor {
 fn heat_map(
     canvas: &Area,
     grid: &Grid,
-    origin: (i32, i32),
+    origin: Origin,
     values: &[Option<f64>],
     greatest: f64,
 ) -> Drawn {
@@ -182,7 +196,7 @@ fn heat_map(
 
 pub(super) fn map(scene: &Scene) -> Option<(Picture, String)> {
     let grid = Grid::of(scene)?;
-    let layout = Layout { columns: 1, rows: 1, extent: scene.size.into(), strip: 0 };
+    let layout = Layout { columns: 1, rows: 1, extent: scene.size.into(), unit: UNIT, strip: 0 };
     let picture = figure(layout.size(), |canvas| {
         let origin = layout.origin(0, 0);
         cells(canvas, &grid, origin)?;
@@ -299,14 +313,14 @@ pub(super) fn deviations(scene: &Scene, panels: &[(usize, &Panel)]) -> Option<(P
 }
 
 /// Lava, goal, walls, start and border of a place in the plane.
-fn arena(canvas: &Area, scene: &Scene, origin: (i32, i32)) -> Drawn {
+fn arena(canvas: &Area, scene: &Scene, origin: Origin) -> Drawn {
     for Place { kind, min, max } in &scene.areas {
         let corners = [at(origin, min[0], min[1]), at(origin, max[0], max[1])];
         canvas.draw(&Rectangle::new(corners, fill(*kind).filled()))?;
     }
     let start = at(origin, scene.start[0], scene.start[1]);
     canvas.draw(&Circle::new(start, 7, INK.stroke_width(3)))?;
-    let corners = [origin, at(origin, scene.size[0], scene.size[1])];
+    let corners = [at(origin, 0.0, 0.0), at(origin, scene.size[0], scene.size[1])];
     canvas.draw(&frame(corners, INK.stroke_width(3)))
 }
 
@@ -382,7 +396,7 @@ pub(super) fn shifts(scene: &Scene, panels: &[(usize, &Panel)]) -> Option<(Pictu
             Some((*panel, classes?))
         })
         .collect();
-    let bins = of_plane(maps.first()?.0).next()?.bins;
+    let PlaneData { bins, bin, .. } = of_plane(maps.first()?.0).next()?;
     // 98 % of the bins stay below it; a few rare ones would take all the colours.
     let mut divergences: Vec<f64> = (maps.iter().flat_map(|(_, maps)| maps))
         .flat_map(|map| map.divergence.iter().zip(&map.visits))
@@ -406,7 +420,7 @@ pub(super) fn shifts(scene: &Scene, panels: &[(usize, &Panel)]) -> Option<(Pictu
                     format!("budget left: {} to {}", share(class), share(class + 1))
                 };
                 title(canvas, origin, &format!("{}, {range}", panel.group.title()), INK)?;
-                shift_map(canvas, origin, bins, map, greatest)?;
+                shift_map(canvas, origin, (*bins, *bin), map, greatest)?;
                 arena(canvas, scene, origin)?;
             }
         }
@@ -415,23 +429,21 @@ pub(super) fn shifts(scene: &Scene, panels: &[(usize, &Panel)]) -> Option<(Pictu
     })?;
     let caption = format!(
         "How the learned antagonist shifts the noise against the greedy protagonist, averaged over the steps \
-         that began in a square of {} m (at least {LEAST_STEPS}), seeds pooled, by remaining budget log \
+         that began in a square of {bin} m (at least {LEAST_STEPS}), seeds pooled, by remaining budget log \
          eta_t / log eta. Arrow: mean of the noise xi, nominally 0; an arrow as long as a square is 1 \
          standard deviation. Colour: divergence of the shifted law from the nominal one, the mean of log \
-         delta_t(o_t).",
-        1.0 / BINS_PER_METRE
+         delta_t(o_t)."
     );
     Some((picture, caption))
 }
 
 fn shift_map(
     canvas: &Area,
-    origin: (i32, i32),
-    [width, height]: [usize; 2],
+    origin: Origin,
+    ([width, height], side): ([usize; 2], f64),
     map: &ShiftMap,
     greatest: f64,
 ) -> Drawn {
-    let side = 1.0 / BINS_PER_METRE;
     for bin in 0..width.saturating_mul(height).min(map.visits.len()) {
         if map.visits[bin] < LEAST_STEPS {
             continue;
@@ -450,7 +462,7 @@ fn shift_map(
 /// An arrow from a place, in the units of the map; too short for a head it is a line.
 fn arrow(
     canvas: &Area,
-    origin: (i32, i32),
+    origin: Origin,
     (x, y): (f64, f64),
     (dx, dy): (f64, f64),
     colour: RGBColor,
@@ -459,10 +471,11 @@ fn arrow(
     let line = vec![at(origin, x, y), at(origin, tip.0, tip.1)];
     canvas.draw(&PathElement::new(line, colour.stroke_width(2)))?;
     let length = dx.hypot(dy);
-    if length * UNIT < 6.0 {
+    if length * origin.unit < 6.0 {
         return Ok(());
     }
-    let (ux, uy) = (dx / length * 0.14, dy / length * 0.14);
+    let head = 0.14 * (UNIT / origin.unit);
+    let (ux, uy) = (dx / length * head, dy / length * head);
     let barb = |sign: f64| at(origin, tip.0 - ux + sign * uy * 0.6, tip.1 - uy - sign * ux * 0.6);
     let head = vec![barb(1.0), at(origin, tip.0, tip.1), barb(-1.0)];
     canvas.draw(&Polygon::new(head, colour.filled()))

@@ -18,8 +18,9 @@ pub use canvas::{Picture, png};
 
 use super::Worlds;
 use super::group::Group;
-use super::records::{Constants, Records};
+use super::records::Records;
 use super::runs::Run;
+use super::settings::Task;
 use super::table::Results;
 
 /// A finished figure.
@@ -44,22 +45,26 @@ pub struct Panel<'a> {
 }
 
 impl Panel<'_> {
-    /// The constants of the first seed that has any; all seeds share them.
-    pub fn constants(&self) -> Option<&Constants> {
-        self.seeds.iter().find_map(|(_, records)| records.constants.as_ref())
+    /// What was played; all seeds share it.
+    pub fn task(&self) -> &Task {
+        &self.group.runs[0].settings.task
     }
 }
 
 /// Reads the records of all runs, by world, then by method and eta, and notes about files that cannot
 /// be read.
-pub fn panels<'a>(results: &'a [Results<'a>]) -> (Vec<Panel<'a>>, Vec<String>) {
+pub fn panels<'a>(
+    results: &'a [Results<'a>],
+    worlds: &dyn Worlds,
+) -> (Vec<Panel<'a>>, Vec<String>) {
     let mut groups: Vec<&Group> = results.iter().flat_map(|results| &results.groups).collect();
     // Stable: within a world the methods keep their order.
     groups.sort_by_key(|group| group.env);
     let mut notes = Vec::new();
     let panels = groups.into_iter().map(|group| {
-        let seeds = group.runs.iter().map(|run| (run, Records::read(run, &mut notes))).collect();
-        Panel { group, seeds }
+        let scene = worlds.scene(group.env, &group.runs[0].settings.task.constants);
+        let records = |run| (run, Records::read(run, scene.as_ref(), &mut notes));
+        Panel { group, seeds: group.runs.iter().map(records).collect() }
     });
     (panels.collect(), notes)
 }
@@ -73,6 +78,8 @@ pub struct Figures {
     pub missing: Vec<String>,
     /// Files that could not be read, and are missing in the figures.
     pub notes: Vec<String>,
+    /// Whole runs that are missing, and why.
+    pub left_out: Vec<String>,
 }
 
 /// Draws all figures that the records allow.
@@ -87,8 +94,8 @@ pub fn draw(panels: &[Panel], notes: Vec<String>, worlds: &dyn Worlds) -> Figure
 impl Figures {
     fn add_world(&mut self, panels: &[Panel], worlds: &dyn Worlds) {
         let env = panels[0].group.env;
-        let constants = panels.iter().find_map(Panel::constants);
-        let scene = constants.and_then(|of| worlds.scene(env, &of.world));
+        let task = panels[0].task();
+        let scene = worlds.scene(env, &task.constants);
         let mut add = |name: &str, title: &str, figure: Option<(Picture, String)>| match figure {
             Some((picture, caption)) => self.drawn.push(Figure {
                 name: format!("{env}-{name}"),
@@ -99,8 +106,8 @@ impl Figures {
             None => self.missing.push(format!("{env}: {title}")),
         };
         // Maps show the panels of one and the same world.
-        let (here, elsewhere): (Vec<_>, Vec<_>) = (panels.iter().enumerate())
-            .partition(|(_, panel)| panel.constants().is_none_or(|own| Some(own) == constants));
+        let (here, elsewhere): (Vec<_>, Vec<_>) =
+            (panels.iter().enumerate()).partition(|(_, panel)| panel.task() == task);
         match &scene {
             Some(scene) if scene.cells => {
                 add("map", "the map", maps::map(scene));
@@ -118,8 +125,8 @@ impl Figures {
             None => {}
         }
         let greatest = panels.iter().map(|panel| panel.group.eta).fold(1.0, f64::max);
-        let optima = constants.filter(|_| here.len() == panels.len()).and_then(|of| {
-            worlds.frontier(env, &of.world, of.gamma, &curves::frontier_budgets(greatest))
+        let optima = Some(task).filter(|_| here.len() == panels.len()).and_then(|of| {
+            worlds.frontier(env, &of.constants, of.gamma, &curves::frontier_budgets(greatest))
         });
         add("frontier", "mean against CVaR", curves::frontier(panels, optima.as_deref(), greatest));
         let regret = curves::regret(panels);

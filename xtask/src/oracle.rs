@@ -1,0 +1,171 @@
+//! The oracle of lava-point over noise and control steps, as a table of what it certifies and how it checks.
+
+use std::fmt::Write as _;
+use std::fs;
+use std::path::Path;
+use std::process::Command;
+
+use anyhow::{Context, Result, ensure};
+use serde_json::Value;
+
+/// Standard deviations of the noise in m/s.
+const NOISES: [f64; 9] = [0.05, 0.1, 0.3, 0.5, 0.6, 1.0, 1.5, 2.0, 3.0];
+
+/// Control steps in s.
+const CONTROL_STEPS: [f64; 5] = [0.05, 0.1, 0.2, 0.3, 0.5];
+
+/// Budget.
+const ETA: u32 = 25;
+
+/// What a row of the table says.
+struct Row {
+    noise: f64,
+    control_step: f64,
+    certified: f64,
+    half_width: f64,
+    script: (String, f64),
+    own: f64,
+    error: f64,
+    lattice: String,
+    seconds: f64,
+}
+
+impl Row {
+    fn new(noise: f64, control_step: f64, answer: &Value) -> Result<Row> {
+        let number = |value: &Value, name: &str| {
+            value[name].as_f64().with_context(|| format!("the answer has no {name}"))
+        };
+        let scripts = answer["baselines"].as_array().context("the answer has no baselines")?;
+        let mut best = (String::new(), f64::NEG_INFINITY);
+        for script in scripts {
+            let cvar = number(script, "cvar")?;
+            if cvar > best.1 {
+                best = (script["name"].as_str().unwrap_or_default().to_owned(), cvar);
+            }
+        }
+        let nodes: Vec<String> = answer["lattice_nodes"]
+            .as_array()
+            .into_iter()
+            .flatten()
+            .map(Value::to_string)
+            .collect();
+        let lattice = &answer["lattice"];
+        Ok(Row {
+            noise,
+            control_step,
+            certified: number(answer, "certified_cvar")?,
+            half_width: (number(answer, "certified_cvar_hi")?
+                - number(answer, "certified_cvar_lo")?)
+                / 2.0,
+            script: best,
+            own: number(answer, "lattice_value")?,
+            error: number(answer, "lattice_error")?,
+            lattice: format!(
+                "{} ({} m, {:.2} m/s)",
+                nodes.join(" x "),
+                number(lattice, "cell")?,
+                number(lattice, "velocity")?
+            ),
+            seconds: number(answer, "seconds")?,
+        })
+    }
+
+    /// Whether the certified value is at least the best script's, and the lattice's own value is within its
+    /// error and three standard errors of it.
+    fn agrees(&self) -> [bool; 2] {
+        let apart = (self.own - self.certified).abs();
+        [self.certified >= self.script.1, apart <= self.error + 1.5 * self.half_width]
+    }
+}
+
+/// Asks a built program for every world of the table, and writes it to `results/oracle`.
+pub fn measure(repository: &Path, target: &Path) -> Result<()> {
+    let program = target.join("release").join("cvar-game");
+    let mut rows = Vec::new();
+    for control_step in CONTROL_STEPS {
+        for noise in NOISES {
+            let output = Command::new(&program)
+                .args(["exact", "--env", "lava-point", "--json", "--anew", "--eta"])
+                .arg(ETA.to_string())
+                .arg("--set")
+                .arg(format!("env.noise={noise}"))
+                .arg("--set")
+                .arg(format!("env.control_step={control_step}"))
+                .output()
+                .with_context(|| format!("{} cannot be started", program.display()))?;
+            let said = String::from_utf8_lossy(&output.stderr).into_owned();
+            ensure!(output.status.success(), "noise {noise}, control step {control_step}: {said}");
+            let row = Row::new(noise, control_step, &serde_json::from_slice(&output.stdout)?)?;
+            println!("{}", line(&row));
+            rows.push(row);
+        }
+    }
+    let folder = repository.join("results").join("oracle");
+    fs::create_dir_all(&folder).with_context(|| format!("{} cannot be made", folder.display()))?;
+    for (name, text) in [("oracle.md", page(&rows)), ("oracle.csv", csv(&rows))] {
+        let path = folder.join(name);
+        fs::write(&path, text).with_context(|| format!("{} cannot be written", path.display()))?;
+    }
+    Ok(())
+}
+
+fn line(row: &Row) -> String {
+    let Row { noise, control_step, certified, half_width, script, own, error, lattice, seconds } =
+        row;
+    format!(
+        "| {control_step} | {noise} | {certified:.4} +- {half_width:.4} | {:.4} ({}) | {own:.4} +- {error:.4} | {lattice} | \
+         {seconds:.0} |",
+        script.1, script.0
+    )
+}
+
+fn page(rows: &[Row]) -> String {
+    let mut text = format!(
+        "# The oracle of lava-point over noise and control steps\n\n\
+         `cargo xtask oracle` made this table, at eta = {ETA}, gamma = 1 and otherwise the default world, with\n\
+         `cvar-game exact --env lava-point --eta {ETA} --set env.noise=SIGMA --set env.control_step=TAU --anew`.\n\n\
+         - *certified*: CVaR_{} of the best controller, over 250,000 episodes in the physical world, with its 95 % interval.\n\
+         - *best script*: the same of the best scripted protagonist, over 20,000 episodes.\n\
+         - *own value*: the lattice's own value of the optimum, with its stated error.\n\n\
+         | control step (s) | noise (m/s) | certified | best script | own value | lattice | seconds |\n\
+         |---|---|---|---|---|---|---|\n",
+        1.0 / f64::from(ETA)
+    );
+    for row in rows {
+        text += &line(row);
+        text.push('\n');
+    }
+    let agree = |which: usize| rows.iter().filter(|row| row.agrees()[which]).count();
+    let _ = write!(
+        text,
+        "\nThe certified value is at least the best script's in {} of {} worlds. The own value is within its stated error\n\
+         and three standard errors of the certified value in {}.\n",
+        agree(0),
+        rows.len(),
+        agree(1)
+    );
+    text
+}
+
+fn csv(rows: &[Row]) -> String {
+    let mut text = "control_step,noise,eta,certified_cvar,half_width,best_script,script_cvar,lattice_value,lattice_error,\
+                    lattice,seconds\n"
+        .to_owned();
+    for row in rows {
+        let _ = writeln!(
+            text,
+            "{},{},{ETA},{:.6},{:.6},{},{:.6},{:.6},{:.6},\"{}\",{:.1}",
+            row.control_step,
+            row.noise,
+            row.certified,
+            row.half_width,
+            row.script.0,
+            row.script.1,
+            row.own,
+            row.error,
+            row.lattice,
+            row.seconds
+        );
+    }
+    text
+}
