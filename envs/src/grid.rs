@@ -322,6 +322,8 @@ impl World for LavaGrid {
     const OBSERVATION: usize = 2;
     /// (x, y) likewise, then the probabilities of the four moves.
     const SITUATION: usize = 2 + MOVES;
+    /// Both vectors begin with the position.
+    const POSITIONS: usize = 2;
 
     fn new(config: &GridConfig, episodes: usize) -> Result<Self, ConfigError> {
         let map = config.parse()?;

@@ -23,12 +23,14 @@ pub use config::{PointConfig, Rectangle};
 use crate::action::{Action, Plane};
 use crate::error::{ConfigError, NoSuchState};
 use crate::law::GaussianLaw;
+use crate::random::ChaCha8Rng;
 use crate::scene::{Area, AreaKind, Field, Scene as Picture};
 use crate::world::{End, Step, World, return_range};
 use geometry::Scene;
 use nalgebra::Vector2;
 use physics::{Body, Physics};
 use rand::{Rng, RngExt};
+use rand_distr::StandardNormal;
 use rapier2d::math::Vector;
 use serde::{Deserialize, Serialize};
 
@@ -154,6 +156,8 @@ impl World for LavaPoint {
     /// Position likewise, and the mean post-force velocity vbar likewise. The parameters of the law
     /// are constants (xi is standard normal, sigma is the config's) and are therefore left out.
     const SITUATION: usize = 4;
+    /// Both vectors begin with the position.
+    const POSITIONS: usize = 2;
 
     fn new(config: &PointConfig, episodes: usize) -> Result<Self, ConfigError> {
         config.check_values()?;
@@ -188,6 +192,29 @@ impl World for LavaPoint {
     fn reset(&mut self, slot: usize) {
         self.bodies[slot] = Body { position: vector(self.config.start), velocity: Vector::ZERO };
         self.clocks[slot] = Clock { time: 0, ended: false };
+    }
+
+    /// The position is uniform over where the disc touches neither lava nor goal, the velocity normal with
+    /// the noise's standard deviation.
+    fn scatter(&mut self, slot: usize, random: &mut ChaCha8Rng) {
+        let PointConfig { arena, radius, goal, noise, horizon, .. } = self.config;
+        if horizon == 1 {
+            return self.reset(slot);
+        }
+        let position = loop {
+            let place = arena.map(|side| random.random_range(radius..=side - radius));
+            let in_goal = (0..2).all(|i| (goal.min[i]..=goal.max[i]).contains(&place[i]));
+            if !in_goal && self.scene.clearance(vector(place)) > 0.0 {
+                break place;
+            }
+        };
+        let fastest = physics::speed_limit(&self.config);
+        let velocity: [f64; 2] = std::array::from_fn(|_| {
+            let velocity = noise * random.sample::<f64, _>(StandardNormal);
+            velocity.clamp(-fastest, fastest)
+        });
+        self.bodies[slot] = Body { position: vector(position), velocity: vector(velocity) };
+        self.clocks[slot] = Clock { time: random.random_range(1..horizon), ended: false };
     }
 
     fn snapshot(&self, slot: usize) -> Snapshot {

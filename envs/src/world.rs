@@ -4,7 +4,9 @@ use crate::action::Action;
 use crate::error::{ConfigError, NoSuchState};
 use crate::finite::FiniteModel;
 use crate::law::Law;
+use crate::random::ChaCha8Rng;
 use crate::scene::{Field, Scene};
+use rand::RngExt;
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 use std::fmt::Debug;
@@ -70,6 +72,9 @@ pub trait World: Sized + Send + Sync + 'static {
     const OBSERVATION: usize;
     /// Length of [`World::situation`]'s vector.
     const SITUATION: usize;
+    /// How many of the first numbers of both vectors are coordinates of a place, each in [-1, 1]. Features
+    /// show them in finer detail; 0 shows all numbers as they are.
+    const POSITIONS: usize = 0;
 
     /// The default constants, as [`World::DEFAULTS`] has them.
     ///
@@ -103,6 +108,23 @@ pub trait World: Sized + Send + Sync + 'static {
 
     /// Puts the slot back to the initial state, at time 0.
     fn reset(&mut self, slot: usize);
+
+    /// Puts the slot anywhere: into a random state in which episodes continue, at a random time from 1 to
+    /// T - 1. A finite world draws both uniformly; one that cannot tell which states there are, or whose T is
+    /// 1, is reset. Training can explore from there.
+    fn scatter(&mut self, slot: usize, random: &mut ChaCha8Rng) {
+        let horizon = self.horizon();
+        let mut place = |model: &mut dyn FiniteModel| {
+            let running: Vec<usize> =
+                (0..model.states()).filter(|&state| model.ended(state).is_none()).collect();
+            let state = running[random.random_range(0..running.len())];
+            model.place(slot, state, random.random_range(1..horizon));
+        };
+        match self.finite_mut() {
+            Some(model) if horizon > 1 => place(model),
+            _ => self.reset(slot),
+        }
+    }
 
     /// The state of the slot's episode.
     fn snapshot(&self, slot: usize) -> Self::Snapshot;

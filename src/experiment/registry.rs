@@ -265,7 +265,8 @@ impl<W: Arena> WorldEntry<W> {
         let path = folder.join("final.safetensors");
         let bytes = read_at_most(&path, LARGEST_FILE).map_err(RunError::file(&path))?;
         require_own(&weights::about(&bytes)?, &run.id()).map_err(RunError::file(&path))?;
-        let mut players = (self.method(run)?.players)(&run.setting());
+        let world = W::new(&constants::<W>(&run.env)?, 1)?;
+        let mut players = (self.method(run)?.players)(&world, &run.setting());
         players.load(&bytes)?;
         Ok(players)
     }

@@ -49,7 +49,8 @@ pub fn execute<W: Arena + Solvable>(
     }
     remove_parts(folder).map_err(RunError::file(folder))?;
     let setting = run.setting();
-    if let Some((players, manifest)) = trained_before(method, &setting, folder, report)? {
+    if let Some((players, manifest)) = trained_before(method, constants, &setting, folder, report)?
+    {
         report(Report::Note("is trained; its weights are evaluated".to_owned()));
         let contestants = Contestants { run, constants, players: &*players, progress: &|| () };
         return evaluate(&contestants, (manifest.steps, manifest.seconds), folder, stop, report);
@@ -82,6 +83,7 @@ type Trained<W> = (Box<dyn Players<W>>, Manifest);
 /// has to be trained.
 fn trained_before<W: Arena>(
     method: &MethodEntry<W>,
+    constants: &W::Constants,
     setting: &Setting<'_>,
     folder: &Path,
     report: &mut dyn FnMut(Report),
@@ -96,7 +98,7 @@ fn trained_before<W: Arena>(
     let Some(manifest) = manifest.filter(|manifest| manifest.failure.is_none()) else {
         return Ok(None);
     };
-    let mut players = (method.players)(setting);
+    let mut players = (method.players)(&W::new(constants, 1)?, setting);
     let loaded = match bytes {
         Ok(bytes) => players.load(&bytes).map_err(|error| error.to_string()),
         Err(error) => Err(error.to_string()),

@@ -8,6 +8,7 @@
 use super::budget_sensitivity::{BudgetSensitivity, LARGEST, STEP};
 use super::device::Device;
 use super::head::{AntagonistHead, Head};
+use super::inputs::{Columns, Inputs};
 use super::network::Network;
 use super::options::{FamilyOptions, PlayerOptions};
 use super::policy::{Draw, Streams};
@@ -51,7 +52,7 @@ pub struct FamilyEntry<L: Law> {
 
 /// How large an antagonist's networks are, and where they are.
 struct Sizes<'a> {
-    inputs: usize,
+    columns: Columns,
     hidden: usize,
     device: Device,
     random: &'a mut ChaCha8Rng,
@@ -90,9 +91,9 @@ impl<L: Law> FamilyEntry<L> {
     const fn of<F: Named<Law = L>>() -> Self {
         FamilyEntry {
             kind: F::KIND,
-            antagonist: |options, Sizes { inputs, hidden, device, random }| {
+            antagonist: |options, Sizes { columns, hidden, device, random }| {
                 let head = AntagonistHead(F::with(options));
-                Box::new(Player::new(head, inputs, hidden, device, random))
+                Box::new(Player::new(head, columns, hidden, device, random))
             },
         }
     }
@@ -115,19 +116,19 @@ pub fn family<L: Perturbed>(options: &FamilyOptions) -> Result<&'static FamilyEn
     })
 }
 
-/// A fresh antagonist that sees `inputs` numbers.
+/// A fresh antagonist that sees samples of these sizes.
 ///
 /// # Panics
 /// If no family of that name fits the law; [`family`] reports that.
 pub fn antagonist<L: Perturbed>(
     options: &FamilyOptions,
-    inputs: usize,
+    columns: Columns,
     hidden: usize,
     device: Device,
     random: &mut ChaCha8Rng,
 ) -> Box<dyn Antagonist<L>> {
     let entry = family::<L>(options).expect("the configuration was checked");
-    (entry.antagonist)(options, Sizes { inputs, hidden, device, random })
+    (entry.antagonist)(options, Sizes { columns, hidden, device, random })
 }
 
 /// What an antagonist acts on and writes to; slices have an entry per slot.
@@ -166,7 +167,7 @@ pub trait Antagonist<L: Law>: Debug + Send {
     fn budget_sensitivity(
         &self,
         played: &Played<L>,
-        with_more_budget: &dyn Fn(&mut [f32], f64),
+        with_more_budget: &dyn Fn(&mut Inputs, f64),
     ) -> BudgetSensitivity;
 
     /// A PPO update, see [`Player::update`].
@@ -234,16 +235,18 @@ impl<F: Family + Send + 'static> Antagonist<F::Law> for Player<AntagonistHead<F>
     fn budget_sensitivity(
         &self,
         played: &Played<F::Law>,
-        with_more_budget: &dyn Fn(&mut [f32], f64),
+        with_more_budget: &dyn Fn(&mut Inputs, f64),
     ) -> BudgetSensitivity {
         let steps = played.rewards.len();
         let mut inputs = played.inputs.clone();
-        let after = self.network.shape().width() * steps;
+        let width = self.network.shape().width();
         let (mut values, mut richer, mut outputs) = (Vec::new(), Vec::new(), Vec::new());
-        self.network.values(&inputs[after..], &mut values);
+        let [_, after] = inputs.rows().split_at(steps, width);
+        self.network.values(after, &mut values);
         with_more_budget(&mut inputs, STEP);
-        self.network.values(&inputs[after..], &mut richer);
-        self.network.act(&inputs[..after], &mut outputs);
+        let [during, after] = inputs.rows().split_at(steps, width);
+        self.network.values(after, &mut richer);
+        self.network.act(during, &mut outputs);
         let mut parameters = Vec::new();
         let elasticity = |i: usize| {
             self.parameters_in(&outputs, i, &mut parameters);

@@ -2,7 +2,7 @@
 //!
 //! PPO needs only draws, log-probabilities and the gradients of log-probability and entropy by
 //! the actor's outputs of a player's law; [`Head`] is exactly that. The protagonist's
-//! heads are the categorical and the Gaussian policy. The antagonist's policy IS the perturbed law
+//! heads are the categorical and the Gaussian policy, and the one of [`super::plane`]. The antagonist's policy IS the perturbed law
 //! of chance and its action IS the realised outcome, so its head wraps a family of perturbations.
 
 use super::options::TrainOptions;
@@ -10,7 +10,7 @@ use super::policy::Mode;
 use crate::game::budget::Budget;
 use crate::game::perturbation::{Family, Perturbation};
 use lava_envs::Force;
-use lava_envs::action::{Action, Discrete, Finite, Plane};
+use lava_envs::action::{Action, Discrete, Finite};
 use lava_envs::law::{Law, sample_index};
 use nalgebra::Vector2;
 use rand::{Rng, RngExt};
@@ -82,8 +82,20 @@ pub trait HeadOf<A: Action> {
     /// The head.
     type Head: PolicyHead<Choice = A>;
 
+    /// Checks the options of the head.
+    ///
+    /// # Errors
+    /// If one does not fit; the error says in one line why and what to do.
+    fn check(options: &TrainOptions) -> Result<(), String> {
+        let _ = options;
+        Ok(())
+    }
+
     /// The head with these options.
     fn head(options: &TrainOptions) -> Self::Head;
+
+    /// Position of an action among finitely many; 0 for any other.
+    fn index(action: A) -> usize;
 }
 
 impl<A: Discrete> HeadOf<A> for Finite {
@@ -92,13 +104,9 @@ impl<A: Discrete> HeadOf<A> for Finite {
     fn head(_: &TrainOptions) -> CategoricalPolicy<A> {
         CategoricalPolicy::default()
     }
-}
 
-impl HeadOf<Force> for Plane {
-    type Head = GaussianPolicy;
-
-    fn head(options: &TrainOptions) -> GaussianPolicy {
-        GaussianPolicy { initial_std: options.initial_std }
+    fn index(action: A) -> usize {
+        action.index()
     }
 }
 

@@ -115,8 +115,8 @@ pub trait Method: Send + Sync + 'static {
     /// Begins training on `world`, whose slots are the parallel episodes.
     fn begin<'a, W: Arena>(world: W, setting: &'a Setting<'a>) -> Box<dyn Training<W> + 'a>;
 
-    /// Players as training begins with them, to be given weights by [`Players::load`].
-    fn players<W: Arena>(setting: &Setting<'_>) -> Box<dyn Players<W>>;
+    /// Players as training in this world begins with them, to be given weights by [`Players::load`].
+    fn players<W: Arena>(world: &W, setting: &Setting<'_>) -> Box<dyn Players<W>>;
 }
 
 /// Training, update by update; between two updates it can be saved and restored.
@@ -182,7 +182,7 @@ pub struct MethodEntry<W: Arena> {
     /// [`Method::begin`].
     pub begin: for<'a> fn(W, &'a Setting<'a>) -> Box<dyn Training<W> + 'a>,
     /// [`Method::players`].
-    pub players: fn(&Setting<'_>) -> Box<dyn Players<W>>,
+    pub players: fn(&W, &Setting<'_>) -> Box<dyn Players<W>>,
 }
 
 impl<W: Arena> MethodEntry<W> {

@@ -1,8 +1,8 @@
 //! Actor and critic of a player: one hidden layer of tanh units each, gradients written out.
 //!
-//! Both networks share one pass. A batch is a matrix with a column per sample. With the input x (a
-//! constant 1 appended, so that biases are weights) of shape `[inputs + 1, n]` and H hidden units
-//! each,
+//! Both networks share one pass. A batch is a matrix with a column per sample. With the input x (the
+//! one-hot code of a cell if there is one, numbers, and a constant 1, so that biases are weights) of shape
+//! `[inputs + 1, n]` and H hidden units each,
 //!
 //! ```text
 //! h = tanh(W x)    [2H, n]       W: [2H, inputs + 1], the actor's half above the critic's
@@ -26,6 +26,7 @@ mod fused;
 mod tensors;
 
 use super::device::Device;
+use super::inputs::{Columns, Rows};
 use fused::Fused;
 use nalgebra::DMatrix;
 use rand::{Rng, RngExt};
@@ -36,8 +37,8 @@ use tensors::Tensors;
 /// Sizes of a player's networks.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Shape {
-    /// Length of the observation, without the constant 1.
-    pub inputs: usize,
+    /// What a sample consists of.
+    pub columns: Columns,
     /// Hidden units H, of actor and of critic each.
     pub hidden: usize,
     /// Outputs k of the actor.
@@ -47,9 +48,14 @@ pub struct Shape {
 }
 
 impl Shape {
-    /// Numbers of one sample's input: the observation and the constant 1.
+    /// Length of x without the constant 1: the cell's one-hot code, then the numbers.
+    pub fn inputs(&self) -> usize {
+        self.columns.cells + self.columns.numbers
+    }
+
+    /// Length of a sample's numbers with the constant 1.
     pub fn width(&self) -> usize {
-        self.inputs + 1
+        self.columns.numbers + 1
     }
 
     /// Rows of y: the actor's outputs and the value.
@@ -58,7 +64,7 @@ impl Shape {
     }
 
     fn first(&self) -> usize {
-        2 * self.hidden * self.width()
+        2 * self.hidden * (self.inputs() + 1)
     }
 
     fn second(&self) -> usize {
@@ -133,9 +139,9 @@ impl Network {
         let hidden = shape.hidden;
         let mut parameters = vec![0.0; shape.parameters()];
         for half in [0, hidden] {
-            let weights = orthogonal(hidden, shape.inputs, 2f64.sqrt(), random);
+            let weights = orthogonal(hidden, shape.inputs(), 2f64.sqrt(), random);
             for unit in 0..hidden {
-                for input in 0..shape.inputs {
+                for input in 0..shape.inputs() {
                     parameters[shape.first_at(half + unit, input)] = weights[(unit, input)] as f32;
                 }
             }
@@ -215,18 +221,17 @@ impl Network {
         }
     }
 
-    /// Outputs of the actor only, shape `[k, n]`; `inputs` holds n samples one after the other,
-    /// shape `[n, inputs + 1]`.
-    pub fn act(&self, inputs: &[f32], outputs: &mut Vec<f32>) {
+    /// Outputs of the actor only, shape `[k, n]`, for n samples.
+    pub fn act(&self, inputs: Rows<'_>, outputs: &mut Vec<f32>) {
         self.evaluate(inputs, false, outputs);
     }
 
     /// Values of the critic only, shape `[n]`, for inputs as in [`Network::act`].
-    pub fn values(&self, inputs: &[f32], values: &mut Vec<f32>) {
+    pub fn values(&self, inputs: Rows<'_>, values: &mut Vec<f32>) {
         self.evaluate(inputs, true, values);
     }
 
-    fn evaluate(&self, inputs: &[f32], critic: bool, outputs: &mut Vec<f32>) {
+    fn evaluate(&self, inputs: Rows<'_>, critic: bool, outputs: &mut Vec<f32>) {
         let (shape, parameters) = (self.shape, &self.parameters);
         match &self.engine {
             Engine::Processor(_) => {
@@ -247,7 +252,7 @@ impl Network {
     /// constants c, which stay zero.
     pub fn differentiate(
         &mut self,
-        inputs: &[f32],
+        inputs: Rows<'_>,
         gradient: &mut Vec<f32>,
         loss: impl FnMut(Outputs<'_>),
     ) {

@@ -4,15 +4,42 @@
 //! given the budget it would solve Chow's decomposition, which is not CVaR-optimal. The antagonist
 //! sees the situation after the action was chosen, its remaining budget as log eta_t / log eta, and
 //! the time if it is time-aware. Every row ends with the constant 1 of the networks' biases.
+//!
+//! As coordinates ([`View::Coordinates`], the paper's) these are a few numbers, in which a small network
+//! cannot turn sharply from one place to the next. As features ([`View::Features`]) they are
+//!
+//! | | protagonist | antagonist |
+//! |---|---|---|
+//! | finite world | the state, one-hot | state and action together, one-hot |
+//! | any other | the observation, and a Fourier basis of its position | the situation likewise |
+//! | time | t, and a Fourier basis of it | the same |
+//!
+//! The Fourier basis of a coordinate c in [-1, 1] is `sin(k pi (c+1)/2), cos(k pi (c+1)/2)` with
+//! k = 1, 2, 4: octaves from half a wave per arena (Konidaris, Osentoski & Thomas 2011, with sines beside
+//! the cosines, one coordinate at a time).
 
-use super::options::TrainOptions;
+use super::head::HeadOf;
+use super::inputs::{Columns, Inputs};
+use super::method::Arena;
+use super::options::{TrainOptions, View};
 use super::policy::Situation;
 use crate::game::budget::Eta;
-use lava_envs::World;
+use lava_envs::{Action, World};
+use std::f32::consts::FRAC_PI_2;
+
+/// Octaves of the Fourier basis.
+const OCTAVES: usize = 3;
+
+/// Numbers of a coordinate's Fourier basis.
+const WAVES: usize = 2 * OCTAVES;
 
 /// What the players of a game see.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Observation {
+    view: View,
+    /// States and actions of a world that is shown by its states; 0 for any other.
+    states: usize,
+    actions: usize,
     protagonist_time: bool,
     antagonist_time: bool,
     /// 1 / log eta, or 0 where the budget is hidden.
@@ -20,10 +47,17 @@ pub struct Observation {
 }
 
 impl Observation {
-    /// What the players of a game with these options see.
-    pub fn new(options: &TrainOptions, eta: Eta) -> Self {
+    /// What the players of a game with these options see of a world.
+    pub fn new<W: World>(world: &W, options: &TrainOptions, eta: Eta) -> Self {
         let blind = options.hide_budget || eta.is_neutral();
+        let finite = match options.observation {
+            View::Coordinates => None,
+            View::Features => world.finite(),
+        };
         Observation {
+            view: options.observation,
+            states: finite.map_or(0, |of| of.states()),
+            actions: finite.map_or(0, |of| of.actions()),
             protagonist_time: options.protagonist.time_aware,
             antagonist_time: options.antagonist.time_aware,
             budget_scale: if blind { 0.0 } else { 1.0 / eta.get().ln() },
@@ -35,50 +69,103 @@ impl Observation {
         self.protagonist_time
     }
 
-    /// Numbers that the protagonist sees.
-    pub fn protagonist_inputs<W: World>(&self) -> usize {
-        W::OBSERVATION + usize::from(self.protagonist_time)
+    /// Sizes of what the protagonist sees.
+    pub fn protagonist_columns<W: World>(&self) -> Columns {
+        let numbers = self.place_columns::<W>(W::OBSERVATION);
+        Columns { cells: self.states, numbers: numbers + self.time_columns(self.protagonist_time) }
     }
 
-    /// Numbers that the antagonist sees.
-    pub fn antagonist_inputs<W: World>(&self) -> usize {
-        W::SITUATION + 1 + usize::from(self.antagonist_time)
+    /// Sizes of what the antagonist sees.
+    pub fn antagonist_columns<W: World>(&self) -> Columns {
+        let numbers = self.place_columns::<W>(W::SITUATION) + 1;
+        let cells = self.states * self.actions;
+        Columns { cells, numbers: numbers + self.time_columns(self.antagonist_time) }
     }
 
-    /// Writes what the protagonist sees in every slot, shape `[slots, protagonist_inputs + 1]`.
-    pub fn protagonist<W: World>(&self, world: &W, inputs: &mut Vec<f32>) {
-        let width = self.protagonist_inputs::<W>() + 1;
-        inputs.resize(world.episodes() * width, 0.0);
-        for (slot, row) in inputs.chunks_exact_mut(width).enumerate() {
-            world.observe(slot, &mut row[..W::OBSERVATION]);
-            close(world, slot, &mut row[W::OBSERVATION..]);
+    /// Writes what the protagonist sees in every slot.
+    pub fn protagonist<W: World>(&self, world: &W, inputs: &mut Inputs) {
+        let width = self.protagonist_columns::<W>().numbers + 1;
+        let place = self.place_columns::<W>(W::OBSERVATION);
+        inputs.cells.clear();
+        inputs.numbers.resize(world.episodes() * width, 0.0);
+        for (slot, row) in inputs.numbers.chunks_exact_mut(width).enumerate() {
+            if let (1.., Some(model)) = (self.states, world.finite()) {
+                inputs.cells.push(model.state(slot) as u32);
+            } else {
+                let (observation, waves) = row[..place].split_at_mut(W::OBSERVATION);
+                world.observe(slot, observation);
+                fourier(observation, waves);
+            }
+            close(world, slot, &mut row[place..]);
         }
     }
 
-    /// Writes what the antagonist sees in every slot, shape `[slots, antagonist_inputs + 1]`.
-    pub fn antagonist<W: World>(&self, of: &Situation<'_, W>, inputs: &mut Vec<f32>) {
-        let width = self.antagonist_inputs::<W>() + 1;
-        inputs.resize(of.world.episodes() * width, 0.0);
-        for (slot, row) in inputs.chunks_exact_mut(width).enumerate() {
-            of.world.situation(slot, of.actions[slot], &mut row[..W::SITUATION]);
-            row[W::SITUATION] = (of.budgets[slot].get().ln() * self.budget_scale) as f32;
-            close(of.world, slot, &mut row[W::SITUATION + 1..]);
+    /// Writes what the antagonist sees in every slot.
+    pub fn antagonist<W: Arena>(&self, of: &Situation<'_, W>, inputs: &mut Inputs) {
+        let width = self.antagonist_columns::<W>().numbers + 1;
+        let place = self.place_columns::<W>(W::SITUATION);
+        inputs.cells.clear();
+        inputs.numbers.resize(of.world.episodes() * width, 0.0);
+        for (slot, row) in inputs.numbers.chunks_exact_mut(width).enumerate() {
+            let action = of.actions[slot];
+            if let (1.., Some(model)) = (self.states, of.world.finite()) {
+                let index = <W::Action as Action>::Kind::index(action);
+                inputs.cells.push((model.state(slot) * self.actions + index) as u32);
+            } else {
+                let (situation, waves) = row[..place].split_at_mut(W::SITUATION);
+                of.world.situation(slot, action, situation);
+                fourier(situation, waves);
+            }
+            row[place] = (of.budgets[slot].get().ln() * self.budget_scale) as f32;
+            close(of.world, slot, &mut row[place + 1..]);
         }
     }
 
     /// Turns rows of the antagonist into those that it would see with exp(`log_factor`) times the
     /// budget.
-    pub fn with_more_budget<W: World>(&self, inputs: &mut [f32], log_factor: f64) {
-        for row in inputs.chunks_exact_mut(self.antagonist_inputs::<W>() + 1) {
-            row[W::SITUATION] += (log_factor * self.budget_scale) as f32;
+    pub fn with_more_budget<W: World>(&self, inputs: &mut Inputs, log_factor: f64) {
+        let place = self.place_columns::<W>(W::SITUATION);
+        for row in inputs.numbers.chunks_exact_mut(self.antagonist_columns::<W>().numbers + 1) {
+            row[place] += (log_factor * self.budget_scale) as f32;
+        }
+    }
+
+    /// Numbers that show where the protagonist is, made from so many of the world's.
+    fn place_columns<W: World>(&self, own: usize) -> usize {
+        match self.view {
+            View::Coordinates => own,
+            View::Features if self.states > 0 => 0,
+            View::Features => own + W::POSITIONS * WAVES,
+        }
+    }
+
+    /// Numbers that show the time.
+    fn time_columns(&self, aware: bool) -> usize {
+        match (aware, self.view) {
+            (false, _) => 0,
+            (true, View::Coordinates) => 1,
+            (true, View::Features) => 1 + WAVES,
         }
     }
 }
 
-/// Writes the time, where there is room for it, and the constant 1.
+/// Writes the time, where there is room for it, its waves, where there is room for them, and the
+/// constant 1.
 fn close<W: World>(world: &W, slot: usize, rest: &mut [f32]) {
-    if let [time, _] = rest {
+    let (one, time) = rest.split_last_mut().expect("there is room for the constant 1");
+    *one = 1.0;
+    if let Some((time, waves)) = time.split_first_mut() {
         *time = 2.0 * world.time(slot) as f32 / world.horizon() as f32 - 1.0;
+        fourier(&[*time], waves);
     }
-    rest[rest.len() - 1] = 1.0;
+}
+
+/// The Fourier basis of as many of the first coordinates as there is room for.
+fn fourier(coordinates: &[f32], waves: &mut [f32]) {
+    for (waves, coordinate) in waves.chunks_exact_mut(WAVES).zip(coordinates) {
+        for (octave, pair) in waves.chunks_exact_mut(2).enumerate() {
+            let phase = FRAC_PI_2 * (1 << octave) as f32 * (coordinate + 1.0);
+            pair.copy_from_slice(&[phase.sin(), phase.cos()]);
+        }
+    }
 }

@@ -25,6 +25,10 @@ pub struct TrainOptions {
     pub leader: Role,
     /// Which action the protagonist's update credits.
     pub credit: Credit,
+    /// Share of the episodes that start anywhere, at the beginning of the run; it falls linearly.
+    pub exploring_starts: f64,
+    /// Share of the run after which every episode starts where episodes start.
+    pub exploring_until: f64,
     /// Share of the run that is played at budget 1, in [0, 1).
     pub budget_wait: f64,
     /// Share of the run over which the budget then rises from 1 to eta, linearly in log eta.
@@ -32,6 +36,8 @@ pub struct TrainOptions {
     /// Share of the run at its end in which only the antagonist is updated, against the greedy
     /// protagonist: a best response to the final policy.
     pub response: f64,
+    /// How both players see the world.
+    pub observation: View,
     /// Who reweights chance.
     pub adversary: Adversary,
     /// Hides the remaining budget from the antagonist (an ablation).
@@ -40,7 +46,9 @@ pub struct TrainOptions {
     pub budget_sensitivity: bool,
     /// The protagonist.
     pub protagonist: PlayerOptions,
-    /// Standard deviation of a Gaussian protagonist's actions at the start (continuous actions).
+    /// The protagonist's law of continuous actions.
+    pub policy: PlaneLaw,
+    /// Standard deviation of the protagonist's continuous actions at the start.
     pub initial_std: f64,
     /// The antagonist.
     pub antagonist: PlayerOptions,
@@ -118,6 +126,27 @@ pub enum Credit {
     Chosen,
     /// The move that was executed: the published code's behaviour; only where chance decides a move.
     Executed,
+}
+
+/// How the players see the world (see [`super::observation`]).
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum View {
+    /// As the few numbers that the world describes a state with.
+    Coordinates,
+    /// As features in which a network can turn sharply: one-hot states of a finite world, a Fourier basis
+    /// of the position in any other.
+    Features,
+}
+
+/// The protagonist's law of pushes in the plane (see [`super::plane`]).
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum PlaneLaw {
+    /// Gaussian; the world scales longer pushes onto the unit disc.
+    Gaussian,
+    /// On the unit disc.
+    Disc,
 }
 
 /// Who reweights chance.

@@ -3,6 +3,7 @@
 use super::device::Device;
 use super::family::{self, Antagonist, Reweighting};
 use super::head::{HeadOf, PolicyHead};
+use super::inputs::Inputs;
 use super::method::{Arena, Players, Setting};
 use super::observation::Observation;
 use super::options::{Adversary, Role};
@@ -32,13 +33,13 @@ pub struct Pair<W: Arena> {
 }
 
 impl<W: Arena> Pair<W> {
-    /// Two fresh players.
-    pub fn new(setting: &Setting<'_>) -> Self {
+    /// Two fresh players for games in this world.
+    pub fn new(world: &W, setting: &Setting<'_>) -> Self {
         let Setting { eta, seed, device, options, .. } = *setting;
-        let observation = Observation::new(options, eta);
+        let observation = Observation::new(world, options, eta);
         let protagonist = Player::new(
             <W::Action as Action>::Kind::head(options),
-            observation.protagonist_inputs::<W>(),
+            observation.protagonist_columns::<W>(),
             options.protagonist.hidden,
             device,
             &mut stream(seed, Purpose::ProtagonistWeights, 0),
@@ -46,7 +47,7 @@ impl<W: Arena> Pair<W> {
         let antagonist = (!eta.is_neutral()).then(|| {
             family::antagonist(
                 &options.family,
-                observation.antagonist_inputs::<W>(),
+                observation.antagonist_columns::<W>(),
                 options.antagonist.hidden,
                 device,
                 &mut stream(seed, Purpose::AntagonistWeights, 0),
@@ -71,7 +72,7 @@ impl<W: Arena> Pair<W> {
         Some(LearnedOpponent {
             antagonist,
             pair: self,
-            inputs: Vec::new(),
+            inputs: Inputs::default(),
             outputs: Vec::new(),
             normalisation_error,
         })
@@ -110,8 +111,8 @@ impl<W: Arena> Players<W> for Pair<W> {
 pub struct PpoPolicy<'a, H: PolicyHead> {
     player: &'a Player<H>,
     observation: Observation,
-    /// What it saw in its last step, shape `[slots, inputs + 1]`.
-    pub inputs: Vec<f32>,
+    /// What it saw in its last step, a sample for each slot.
+    pub inputs: Inputs,
     /// The outputs of its actor for it, shape `[k, slots]`.
     pub outputs: Vec<f32>,
     parameters: Vec<f64>,
@@ -127,7 +128,7 @@ impl<'a, H: PolicyHead> PpoPolicy<'a, H> {
     /// Lets the actor see the world.
     fn look<W: World>(&mut self, world: &W) {
         self.observation.protagonist(world, &mut self.inputs);
-        self.player.network.act(&self.inputs, &mut self.outputs);
+        self.player.network.act(self.inputs.rows(), &mut self.outputs);
     }
 
     /// log-probability of a choice in a slot of the last step.
@@ -175,8 +176,8 @@ impl<W: World, H: PolicyHead<Choice = W::Action>> Policy<W> for PpoPolicy<'_, H>
 pub struct LearnedOpponent<'a, W: Arena> {
     antagonist: &'a dyn Antagonist<W::Law>,
     pair: &'a Pair<W>,
-    /// What it saw in its last step, shape `[slots, inputs + 1]`.
-    pub inputs: Vec<f32>,
+    /// What it saw in its last step, a sample for each slot.
+    pub inputs: Inputs,
     outputs: Vec<f32>,
     normalisation_error: Option<f64>,
 }
@@ -199,7 +200,7 @@ impl<W: Arena> Opponent<W> for LearnedOpponent<'_, W> {
         self.look(situation);
         let outputs = match self.pair.adversary {
             Adversary::Learned => {
-                self.antagonist.network().act(&self.inputs, &mut self.outputs);
+                self.antagonist.network().act(self.inputs.rows(), &mut self.outputs);
                 Some(&self.outputs[..])
             }
             Adversary::Random => None,

@@ -15,6 +15,7 @@ use crate::learn::budget_sensitivity::BudgetSensitivity;
 use crate::learn::device::Device;
 use crate::learn::gae;
 use crate::learn::head::Head;
+use crate::learn::inputs::{Columns, Inputs};
 use crate::learn::network::{Network, Outputs, Shape};
 use crate::learn::options::PlayerOptions;
 use crate::learn::state::{PlayerState, Unfit};
@@ -40,7 +41,7 @@ struct Workspace<H: Head> {
     advantages: Vec<f32>,
     samples: Vec<Sample<H>>,
     order: Vec<usize>,
-    inputs: Vec<f32>,
+    inputs: Inputs,
     batch: Vec<Sample<H>>,
     gradient: Vec<f32>,
 }
@@ -52,7 +53,7 @@ impl<H: Head> Default for Workspace<H> {
             advantages: Vec::new(),
             samples: Vec::new(),
             order: Vec::new(),
-            inputs: Vec::new(),
+            inputs: Inputs::default(),
             batch: Vec::new(),
             gradient: Vec::new(),
         }
@@ -126,16 +127,16 @@ pub struct Sample<H: Head> {
 }
 
 impl<H: Head> Player<H> {
-    /// A fresh player that sees `inputs` numbers.
+    /// A fresh player that sees samples of these sizes.
     pub fn new(
         head: H,
-        inputs: usize,
+        columns: Columns,
         hidden: usize,
         device: Device,
         random: &mut ChaCha8Rng,
     ) -> Self {
         let constants = head.constants();
-        let shape = Shape { inputs, hidden, outputs: head.outputs(), constants: constants.len() };
+        let shape = Shape { columns, hidden, outputs: head.outputs(), constants: constants.len() };
         Self::with_network(head, Network::new(shape, &constants, device, random))
     }
 
@@ -202,7 +203,7 @@ impl<H: Head> Player<H> {
     ) -> Losses {
         let Workspace { values, advantages, samples, order, inputs, batch, gradient } =
             &mut self.workspace;
-        self.network.values(&trajectories.inputs, values);
+        self.network.values(trajectories.inputs.rows(), values);
         gae::advantages(
             &trajectories.rewards,
             &trajectories.ended,
@@ -227,7 +228,7 @@ impl<H: Head> Player<H> {
             }
         }
 
-        let row = self.network.shape().width();
+        let width = self.network.shape().width();
         order.clear();
         order.extend(0..samples.len());
         let mut losses =
@@ -240,12 +241,12 @@ impl<H: Head> Player<H> {
                 inputs.clear();
                 batch.clear();
                 for &i in indices {
-                    inputs.extend_from_slice(&trajectories.inputs[i * row..(i + 1) * row]);
+                    inputs.extend(trajectories.inputs.rows().row(i, width));
                     batch.push(samples[i].clone());
                 }
                 let constants = self.network.constants().to_vec();
                 let mut loss = Loss::new(&self.head, batch, options, rates.entropy, &constants);
-                self.network.differentiate(inputs, gradient, |block| loss.add(block));
+                self.network.differentiate(inputs.rows(), gradient, |block| loss.add(block));
                 let at = gradient.len() - constants.len();
                 let mut step = loss.finish(&mut gradient[at..]);
                 step.gradient_norm = clip_norm(gradient, options.gradient_norm);

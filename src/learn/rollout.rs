@@ -12,6 +12,7 @@ use crate::game::budget::{Budget, Eta};
 use crate::game::returns::{Atom, ReturnSoFar};
 use lava_envs::random::{Purpose, position, stream, stream_from};
 use lava_envs::{End, Law, World};
+use rand::RngExt;
 
 /// Plays and records.
 pub struct Collector<W: World> {
@@ -26,7 +27,8 @@ pub struct Collector<W: World> {
     pub protagonist: Trajectories<(), W::Action>,
     /// What the antagonist recorded; empty if it did not play.
     pub antagonist: Played<W::Law>,
-    /// Episodes that ended in the last rollout; their masses have no meaning.
+    /// Episodes that ended in the last rollout, without those that started anywhere; their masses have no
+    /// meaning.
     pub finished: Vec<Atom>,
     /// max prod delta / eta over all trajectories so far, at most 1 up to rounding.
     pub budget_use: f64,
@@ -39,6 +41,8 @@ pub struct Terms {
     pub eta: Eta,
     /// How the protagonist picks its actions.
     pub mode: Mode,
+    /// Share of the episodes that start anywhere.
+    pub exploring: f64,
 }
 
 impl<W: Arena> Collector<W> {
@@ -78,7 +82,7 @@ impl<W: Arena> Collector<W> {
         for slot in 0..self.game.slots() {
             // No step was made yet: the episode has this budget as well.
             if self.game.world.time(slot) == 0 {
-                self.begin(slot, terms.eta);
+                self.begin(slot, terms);
             }
         }
         for _ in 0..options.rollout_steps {
@@ -92,21 +96,25 @@ impl<W: Arena> Collector<W> {
                 self.record_antagonist(opponent);
             }
             for slot in 0..self.game.slots() {
-                self.count(slot, terms.eta);
+                self.count(slot, terms);
             }
         }
         // The states after the last step. The antagonist's state holds an action: one is drawn for
         // this purpose only, which leaves its value unbiased.
         self.game.choose(&mut policy, terms.mode);
-        self.protagonist.inputs.extend_from_slice(&policy.inputs);
+        self.protagonist.inputs.extend(policy.inputs.rows());
         if let Some(opponent) = &mut opponent {
             opponent.look(&self.game.situation());
-            self.antagonist.inputs.extend_from_slice(&opponent.inputs);
+            self.antagonist.inputs.extend(opponent.inputs.rows());
         }
     }
 
-    fn begin(&mut self, slot: usize, eta: Eta) {
-        self.game.start(slot, eta);
+    fn begin(&mut self, slot: usize, Terms { eta, exploring, .. }: Terms) {
+        if exploring > 0.0 && self.game.streams[slot].actions.random_bool(exploring) {
+            self.game.start_anywhere(slot, eta);
+        } else {
+            self.game.start(slot, eta);
+        }
         self.start[slot] = eta;
         self.so_far[slot] = ReturnSoFar::START;
         self.products[slot] = 1.0;
@@ -118,7 +126,7 @@ impl<W: Arena> Collector<W> {
         credit: Credit,
     ) {
         let (game, record) = (&self.game, &mut self.protagonist);
-        record.inputs.extend_from_slice(&policy.inputs);
+        record.inputs.extend(policy.inputs.rows());
         for slot in 0..game.slots() {
             let choice = match credit {
                 Credit::Chosen => None,
@@ -135,7 +143,7 @@ impl<W: Arena> Collector<W> {
 
     fn record_antagonist(&mut self, opponent: &LearnedOpponent<'_, W>) {
         let (game, record) = (&self.game, &mut self.antagonist);
-        record.inputs.extend_from_slice(&opponent.inputs);
+        record.inputs.extend(opponent.inputs.rows());
         for slot in 0..game.slots() {
             let (law, outcome) = (game.laws[slot], game.outcomes[slot]);
             record.given.push((law, game.budgets_before[slot]));
@@ -148,14 +156,17 @@ impl<W: Arena> Collector<W> {
     }
 
     /// Accumulates the last step of a slot, and starts a new episode when its own has ended.
-    fn count(&mut self, slot: usize, eta: Eta) {
+    fn count(&mut self, slot: usize, terms: Terms) {
         let step = self.game.steps[slot];
         self.so_far[slot].add(step.reward, self.gamma);
         self.products[slot] *= self.game.ratios[slot];
         if let Some(end) = step.end {
-            self.finished.push(self.so_far[slot].ended(end));
+            let explored = self.game.world.time(slot) != self.so_far[slot].steps;
+            if !explored {
+                self.finished.push(self.so_far[slot].ended(end));
+            }
             self.budget_use = self.budget_use.max(self.products[slot] / self.start[slot].get());
-            self.begin(slot, eta);
+            self.begin(slot, terms);
         }
     }
 

@@ -1,14 +1,16 @@
 //! What a rollout records for one player, for its update to learn from.
 
+use super::inputs::Inputs;
+
 /// What one player saw, chose and earned. Time-major: index `t * slots + slot`. `G` is what the law
 /// of the choice depended on besides the network's outputs, `C` the choice.
 #[derive(Debug, Clone)]
 pub struct Trajectories<G, C> {
     /// Number of slots.
     pub slots: usize,
-    /// Inputs, shape `[steps + 1, slots, inputs + 1]`; the last block is the state after the last
-    /// step, for bootstrapping.
-    pub inputs: Vec<f32>,
+    /// Inputs, samples of shape `[steps + 1, slots]`; the last block is the state after the last step,
+    /// for bootstrapping.
+    pub inputs: Inputs,
     /// What the law depended on, `[steps, slots]`.
     pub given: Vec<G>,
     /// Choices, `[steps, slots]`.
@@ -26,7 +28,7 @@ impl<G, C> Trajectories<G, C> {
     pub fn new(slots: usize) -> Self {
         Trajectories {
             slots,
-            inputs: Vec::new(),
+            inputs: Inputs::default(),
             given: Vec::new(),
             choices: Vec::new(),
             log_probabilities: Vec::new(),

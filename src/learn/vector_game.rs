@@ -62,6 +62,12 @@ impl<W: World> VectorGame<W> {
         self.budgets[slot] = Budget::start(eta);
     }
 
+    /// Starts a new game in the slot from anywhere.
+    pub fn start_anywhere(&mut self, slot: usize, eta: Eta) {
+        self.world.scatter(slot, &mut self.streams[slot].actions);
+        self.budgets[slot] = Budget::start(eta);
+    }
+
     /// One step of the game in every slot that is not idle.
     pub fn step(
         &mut self,

@@ -8,6 +8,7 @@
 //! | `PLAYER.critic.output.weight`, `.bias` | `[1, hidden]`, `[1]` |
 //! | `PLAYER.actor.constants` | `[constants]`: log standard deviations of a Gaussian policy |
 //!
+//! `inputs` are the one-hot code of the cell, where the player sees one, and then its numbers.
 //! PLAYER is `protagonist` or `antagonist`; all f32. `outputs(x) = W2 tanh(W1 x + b1) + b2`.
 
 use super::device::Device;
@@ -140,7 +141,8 @@ impl Place {
 
 /// All tensors of a player, out of the flat layout of [`crate::learn::network`].
 fn layout(role: Role, shape: Shape) -> Vec<(String, Place)> {
-    let Shape { inputs, hidden, outputs, constants } = shape;
+    let Shape { hidden, outputs, constants, .. } = shape;
+    let inputs = shape.inputs();
     let mut places = Vec::new();
     let mut add = |name: &str, shape: Vec<usize>, start, strides| {
         places.push((format!("{role}.{name}"), Place { shape, start, strides }));

@@ -11,6 +11,17 @@ const RENAMED: [(&str, &str); 3] = [
     ("evaluation.exhibit_episodes", "evaluation.figure_episodes"),
 ];
 
+/// What former versions did not write, by section and key, with the value that it had in them.
+fn added() -> [(&'static str, &'static str, Value); 5] {
+    [
+        ("train.family", "train.family.kind", "auto".into()),
+        ("train", "train.observation", "coordinates".into()),
+        ("train", "train.policy", "gaussian".into()),
+        ("train", "train.exploring_starts", 0.0.into()),
+        ("train", "train.exploring_until", 1.0.into()),
+    ]
+}
+
 /// The present name of a former key.
 pub(super) fn present(key: &str) -> Option<String> {
     RENAMED.iter().find_map(|(former, present)| {
@@ -27,9 +38,10 @@ pub(super) fn update(run: &mut Table) {
             insert(run, present, value);
         }
     }
-    let family = "train.family.kind";
-    if at(run, "train.family").is_some() && at(run, family).is_none() {
-        insert(run, family, "auto".into());
+    for (section, key, value) in added() {
+        if at(run, section).is_some() && at(run, key).is_none() {
+            insert(run, key, value);
+        }
     }
 }
 

@@ -3,6 +3,8 @@
 
 use crate::game::budget::Eta;
 use crate::learn::family;
+use crate::learn::head::HeadOf;
+use crate::learn::inputs::Inputs;
 use crate::learn::method::{
     Arena, Method, Metric, Players, Progress, Setting, TrainError, Training,
 };
@@ -12,8 +14,8 @@ use crate::learn::policy::Mode;
 use crate::learn::ppo::{Losses, Rates};
 use crate::learn::rollout::{Collector, Terms};
 use crate::learn::state::{TrainingState, Unfit};
-use lava_envs::End;
 use lava_envs::random::{ChaCha8Rng, Purpose, position, stream, stream_from};
+use lava_envs::{Action, End};
 
 /// The method `game`.
 #[derive(Debug, Clone, Copy)]
@@ -47,6 +49,7 @@ impl Method for Game {
                 W::NAME
             ));
         }
+        <W::Action as Action>::Kind::check(options)?;
         family::family::<W::Law>(&options.family).map(|_| ())
     }
 
@@ -82,8 +85,8 @@ impl Method for Game {
         Box::new(GameTraining::new(world, setting))
     }
 
-    fn players<W: Arena>(setting: &Setting<'_>) -> Box<dyn Players<W>> {
-        Box::new(Pair::<W>::new(setting))
+    fn players<W: Arena>(world: &W, setting: &Setting<'_>) -> Box<dyn Players<W>> {
+        Box::new(Pair::new(world, setting))
     }
 }
 
@@ -106,7 +109,7 @@ impl<'a, W: Arena> GameTraining<'a, W> {
             setting,
             turns: schedule(setting.options, setting.eta),
             done: 0,
-            pair: Pair::new(setting),
+            pair: Pair::new(&world, setting),
             collector: Collector::new(world, setting),
             minibatches: stream(setting.seed, Purpose::Minibatches, 0),
         }
@@ -116,12 +119,16 @@ impl<'a, W: Arena> GameTraining<'a, W> {
     fn turn(&mut self, turn: &Turn) -> Losses {
         let Setting { gamma, options, .. } = *self.setting;
         let GameTraining { pair, collector, minibatches, .. } = self;
-        collector.collect(pair, Terms { eta: turn.budget, mode: turn.mode }, options);
+        collector.collect(
+            pair,
+            Terms { eta: turn.budget, mode: turn.mode, exploring: turn.exploring },
+            options,
+        );
         match (turn.role, &mut pair.antagonist) {
             (Role::Antagonist, Some(antagonist)) => {
                 let played = &collector.antagonist;
                 let observation = pair.observation;
-                let more = |inputs: &mut [f32], by| observation.with_more_budget::<W>(inputs, by);
+                let more = |inputs: &mut Inputs, by| observation.with_more_budget::<W>(inputs, by);
                 let sensitivity = options
                     .budget_sensitivity
                     .then(|| antagonist.budget_sensitivity(played, &more));
@@ -240,6 +247,8 @@ pub struct Turn {
     pub budget: Eta,
     /// How the protagonist picks its actions in the rollout.
     pub mode: Mode,
+    /// Share of the rollout's episodes that start anywhere.
+    pub exploring: f64,
     /// Rates of the update.
     pub rates: Rates,
 }
@@ -267,7 +276,8 @@ pub fn schedule(options: &TrainOptions, eta: Eta) -> Vec<Turn> {
         };
         let response = role == Role::Antagonist && is_response(options, update as u64, updates);
         let mode = if response { Mode::Greedy } else { Mode::Sampled };
-        Turn { update: update as u64 + 1, role, budget, mode, rates }
+        let exploring = exploring_at(options, update as f64 / updates as f64);
+        Turn { update: update as u64 + 1, role, budget, mode, exploring, rates }
     };
     roles.iter().enumerate().map(turn).collect()
 }
@@ -306,4 +316,10 @@ fn budget_at(options: &TrainOptions, eta: Eta, progress: f64) -> Eta {
     } else {
         eta
     }
+}
+
+/// The share of episodes that start anywhere at a point of the run in [0, 1).
+fn exploring_at(options: &TrainOptions, progress: f64) -> f64 {
+    let left = 1.0 - progress / options.exploring_until;
+    if left > 0.0 { options.exploring_starts * left } else { 0.0 }
 }

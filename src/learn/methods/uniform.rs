@@ -21,7 +21,7 @@ impl Method for Uniform {
         Box::new(Uniform)
     }
 
-    fn players<W: Arena>(_: &Setting<'_>) -> Box<dyn Players<W>> {
+    fn players<W: Arena>(_: &W, _: &Setting<'_>) -> Box<dyn Players<W>> {
         Box::new(Uniform)
     }
 }

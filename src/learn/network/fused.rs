@@ -6,6 +6,7 @@
 //! numbers sample by sample in rows: row i of `x` is input i of all its samples.
 
 use super::{Outputs, Shape};
+use crate::learn::inputs::Rows;
 use pulp::{Arch, Simd, WithSimd};
 
 /// Samples of a block: a multiple of the width of any vector register.
@@ -77,18 +78,29 @@ fn load(inputs: &[f32], width: usize, x: &mut [f32]) {
 #[inline(always)]
 fn hidden_layer<S: Simd>(
     simd: S,
-    weights: &[f32],
-    units: usize,
+    shape: Shape,
+    parameters: &[f32],
     first: usize,
+    cells: &[u32],
     x: &[f32],
     h: &mut [f32],
 ) {
+    let units = 2 * shape.hidden;
+    let (columns, weights) = parameters.split_at(shape.columns.cells * units);
+    // What a cell adds to z is its column of W.
+    h.fill(0.0);
+    for (sample, &cell) in cells.iter().enumerate() {
+        let column = &columns[cell as usize * units + first..];
+        for (z, &weight) in h.chunks_exact_mut(SAMPLES).zip(column) {
+            z[sample] = weight;
+        }
+    }
     let (x, _) = S::as_simd_f32s(x);
     let (h, _) = S::as_mut_simd_f32s(h);
     let vectors = SAMPLES / S::F32_LANES;
     for (unit, h) in h.chunks_exact_mut(vectors).enumerate() {
         for (vector, h) in h.iter_mut().enumerate() {
-            let mut z = simd.splat_f32s(0.0);
+            let mut z = *h;
             for (input, x) in x.chunks_exact(vectors).enumerate() {
                 let weight = simd.splat_f32s(weights[input * units + first + unit]);
                 z = simd.mul_add_e_f32s(weight, x[vector], z);
@@ -126,8 +138,8 @@ pub struct Evaluate<'a> {
     pub shape: Shape,
     /// Its parameters.
     pub parameters: &'a [f32],
-    /// Inputs, shape `[n, inputs + 1]`.
-    pub inputs: &'a [f32],
+    /// n samples.
+    pub inputs: Rows<'a>,
     /// The critic's row, or else the actor's.
     pub critic: bool,
     /// Outputs, shape `[rows, n]`.
@@ -150,14 +162,14 @@ impl WithSimd for Evaluate<'_> {
         let (width, hidden) = (shape.width(), shape.hidden);
         let (first, rows) =
             if critic { (hidden, shape.outputs..shape.rows()) } else { (0, 0..shape.outputs) };
-        let samples = inputs.len() / width;
+        let samples = inputs.numbers.len() / width;
         outputs.resize(rows.len() * samples, 0.0);
         let (mut x, mut h) = (Aligned::default(), Aligned::default());
         let (x, h) = (x.slice(width * SAMPLES), h.slice(hidden * SAMPLES));
         let mut y = [0.0; SAMPLES];
-        for (block, inputs) in inputs.chunks(width * SAMPLES).enumerate() {
-            load(inputs, width, x);
-            hidden_layer(simd, parameters, 2 * hidden, first, x, h);
+        for (block, inputs) in inputs.blocks(SAMPLES, width).enumerate() {
+            load(inputs.numbers, width, x);
+            hidden_layer(simd, shape, parameters, first, inputs.cells, x, h);
             let start = block * SAMPLES;
             let end = samples.min(start + SAMPLES);
             for (index, row) in rows.clone().enumerate() {
@@ -177,8 +189,8 @@ pub struct Differentiate<'a, L> {
     pub shape: Shape,
     /// Its parameters.
     pub parameters: &'a [f32],
-    /// Inputs, shape `[n, inputs + 1]`.
-    pub inputs: &'a [f32],
+    /// n samples.
+    pub inputs: Rows<'a>,
     /// Receives the gradient by W, V and b.
     pub gradient: &'a mut [f32],
     /// Turns outputs into gradients.
@@ -210,10 +222,10 @@ impl<L: FnMut(Outputs<'_>)> WithSimd for Differentiate<'_, L> {
         by_first.fill(0.0);
         by_second.fill(0.0);
         gradient.fill(0.0);
-        for (block, inputs) in inputs.chunks(width * SAMPLES).enumerate() {
-            let samples = inputs.len() / width;
-            load(inputs, width, x);
-            hidden_layer(simd, parameters, units, 0, x, h);
+        for (block, inputs) in inputs.blocks(SAMPLES, width).enumerate() {
+            let samples = inputs.numbers.len() / width;
+            load(inputs.numbers, width, x);
+            hidden_layer(simd, shape, parameters, 0, inputs.cells, x, h);
             for (row, y) in y.chunks_exact_mut(SAMPLES).enumerate() {
                 let units = shape.half(row);
                 let at = shape.second_at(row, units.start);
@@ -226,12 +238,19 @@ impl<L: FnMut(Outputs<'_>)> WithSimd for Differentiate<'_, L> {
                 y[samples..].fill(0.0);
                 gradient[shape.bias_at() + row] += y.iter().sum::<f32>();
             }
-            backward(simd, shape, parameters, [&x[..], &h[..], &y[..]], by_first, by_second);
+            backward(simd, shape, parameters, [x, y], h, by_first, by_second);
+            // The gradient by the column of W that a cell selects is that by z.
+            for (sample, &cell) in inputs.cells.iter().enumerate() {
+                let column = &mut gradient[shape.first_at(0, cell as usize)..][..units];
+                for (sum, by_z) in column.iter_mut().zip(h.chunks_exact(SAMPLES)) {
+                    *sum += by_z[sample];
+                }
+            }
         }
         let (by_first, by_second) = (S::as_simd_f32s(by_first).0, S::as_simd_f32s(by_second).0);
         for unit in 0..units {
             for input in 0..width {
-                gradient[shape.first_at(unit, input)] =
+                gradient[shape.first_at(unit, shape.columns.cells + input)] =
                     simd.reduce_sum_f32s(by_first[unit * width + input]);
             }
         }
@@ -244,23 +263,27 @@ impl<L: FnMut(Outputs<'_>)> WithSimd for Differentiate<'_, L> {
     }
 }
 
-/// Adds a block's gradient by W' and V, given x, h and dL/dy.
+/// Adds a block's gradient by V and by the columns of W for x, given x, dL/dy and h, and turns h into
+/// dL/dz, z = W x.
 #[inline(always)]
 fn backward<S: Simd>(
     simd: S,
     shape: Shape,
     parameters: &[f32],
-    [x, h, y]: [&[f32]; 3],
+    [x, y]: [&[f32]; 2],
+    h: &mut [f32],
     by_first: &mut [f32],
     by_second: &mut [f32],
 ) {
-    let (x, h, y) = (S::as_simd_f32s(x).0, S::as_simd_f32s(h).0, S::as_simd_f32s(y).0);
+    let (x, y) = (S::as_simd_f32s(x).0, S::as_simd_f32s(y).0);
+    let h = S::as_mut_simd_f32s(h).0;
     let (by_first, by_second) = (S::as_mut_simd_f32s(by_first).0, S::as_mut_simd_f32s(by_second).0);
     let vectors = SAMPLES / S::F32_LANES;
     let (k, hidden, width) = (shape.outputs, shape.hidden, shape.width());
-    for (unit, h) in h.chunks_exact(vectors).enumerate() {
+    for (unit, h) in h.chunks_exact_mut(vectors).enumerate() {
         let (rows, at) = if unit < hidden { (0..k, unit) } else { (k..k + 1, unit - hidden) };
-        for (vector, &h) in h.iter().enumerate() {
+        for (vector, entry) in h.iter_mut().enumerate() {
+            let h = *entry;
             let mut by_h = simd.splat_f32s(0.0);
             for row in rows.clone() {
                 let y = y[row * vectors + vector];
@@ -272,6 +295,7 @@ fn backward<S: Simd>(
             // d tanh = 1 - tanh^2.
             let slope = simd.sub_f32s(simd.splat_f32s(1.0), simd.mul_f32s(h, h));
             let by_z = simd.mul_f32s(by_h, slope);
+            *entry = by_z;
             for (input, sum) in by_first[unit * width..][..width].iter_mut().enumerate() {
                 *sum = simd.mul_add_e_f32s(by_z, x[input * vectors + vector], *sum);
             }

@@ -5,6 +5,7 @@
 //! `dL/dh x'`.
 
 use super::{Outputs, Shape};
+use crate::learn::inputs::Rows;
 use tch::{Device, Kind, Tensor};
 
 /// The network on a device.
@@ -41,7 +42,7 @@ impl Tensors {
             let (first, second) = (shape.first() as i64, shape.second() as i64);
             let wide = 2 * shape.hidden as i64;
             (
-                tensor.narrow(0, 0, first).view([shape.width() as i64, wide]).tr(),
+                tensor.narrow(0, 0, first).view([shape.inputs() as i64 + 1, wide]).tr(),
                 tensor.narrow(0, first, second).view([shape.rows() as i64, wide]),
             )
         };
@@ -69,7 +70,7 @@ impl Tensors {
     }
 
     /// The actor's outputs, shape `[k, n]`, or the critic's, shape `[1, n]`, without their biases.
-    pub fn evaluate(&self, inputs: &[f32], critic: bool, outputs: &mut Vec<f32>) {
+    pub fn evaluate(&self, inputs: Rows<'_>, critic: bool, outputs: &mut Vec<f32>) {
         let (hidden, k) = (self.shape.hidden as i64, self.shape.outputs as i64);
         let (unit, row, rows) = if critic { (hidden, k, 1) } else { (0, 0, k) };
         let h = tanh_(self.first.narrow(0, unit, hidden).mm(&self.columns(inputs)));
@@ -80,7 +81,7 @@ impl Tensors {
     pub fn differentiate(
         &mut self,
         parameters: &[f32],
-        inputs: &[f32],
+        inputs: Rows<'_>,
         gradient: &mut Vec<f32>,
         mut loss: impl FnMut(Outputs<'_>),
     ) {
@@ -119,8 +120,16 @@ impl Tensors {
     }
 
     /// x, a column per sample.
-    fn columns(&self, inputs: &[f32]) -> Tensor {
-        Tensor::from_slice(inputs).view([-1, self.shape.width() as i64]).to_device(self.device).tr()
+    fn columns(&self, inputs: Rows<'_>) -> Tensor {
+        let numbers = Tensor::from_slice(inputs.numbers).view([-1, self.shape.width() as i64]);
+        let numbers = numbers.to_device(self.device);
+        if inputs.cells.is_empty() {
+            return numbers.tr();
+        }
+        let cells: Vec<i64> = inputs.cells.iter().map(|&cell| i64::from(cell)).collect();
+        let cells = Tensor::from_slice(&cells).to_device(self.device);
+        let one_hot = cells.one_hot(self.shape.columns.cells as i64).to_kind(Kind::Float);
+        Tensor::cat(&[one_hot, numbers], 1).tr()
     }
 }
 
