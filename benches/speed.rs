@@ -21,6 +21,7 @@ use cvar_game::game::gaussian::GaussianFamily;
 use cvar_game::game::perturbation::{Family, Perturbation};
 use cvar_game::learn::device::Device;
 use cvar_game::learn::family::Named;
+use cvar_game::learn::inputs::Inputs;
 use cvar_game::learn::method::{Arena, Setting, Training};
 use cvar_game::learn::methods::game::GameTraining;
 use cvar_game::learn::options::TrainOptions;
@@ -116,7 +117,7 @@ fn rollouts(criterion: &mut Criterion) {
 
 /// How the rollouts are played.
 fn terms() -> Terms {
-    Terms { eta: eta(), mode: Mode::Sampled }
+    Terms { eta: eta(), mode: Mode::Sampled, exploring: 0.0 }
 }
 
 fn rollout<W: Arena>(criterion: &mut Criterion) {
@@ -155,7 +156,7 @@ fn update<W: Arena>(criterion: &mut Criterion) {
     let player = pair.antagonist.as_mut().expect("eta is above 1");
     let its = &options.antagonist;
     let observation = pair.observation;
-    let more = |inputs: &mut [f32], by: f64| observation.with_more_budget::<W>(inputs, by);
+    let more = |inputs: &mut Inputs, by: f64| observation.with_more_budget::<W>(inputs, by);
     group.bench_function(BenchmarkId::new(W::NAME, "antagonist"), |bencher| {
         bencher.iter(|| {
             let played = &collector.antagonist;
@@ -197,7 +198,7 @@ fn training<W: Arena>(criterion: &mut Criterion) {
 /// A fresh pair and its games.
 fn opening<W: Arena>(options: &TrainOptions) -> (Pair<W>, Collector<W>) {
     let setting = setting(options);
-    (Pair::new(&setting), Collector::new(world(options), &setting))
+    (Pair::new(&world(options), &setting), Collector::new(world(options), &setting))
 }
 
 /// Short measurements: the whole file in a minute.

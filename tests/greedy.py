@@ -44,9 +44,12 @@ def load(run, player="protagonist", part="actor"):
     return net.eval()
 
 
-def observations(rows):
-    """What the protagonist sees in each cell: x and y, first to last cell mapped onto [-1, 1]."""
+def observations(rows, view):
+    """What the protagonist sees in each cell: as features the cell, one-hot; as coordinates x and y, first to
+    last cell mapped onto [-1, 1]."""
     height, width = len(rows), len(rows[0])
+    if view == "features":
+        return torch.eye(height * width)
     scaled = lambda i, n: 0.0 if n == 1 else 2.0 * i / (n - 1) - 1.0
     return torch.tensor([[scaled(x, width), scaled(y, height)] for y in range(height) for x in range(width)])
 
@@ -55,7 +58,8 @@ def main(run, as_json):
     config = tomllib.loads((Path(run) / "config.toml").read_text())
     rows = config["env"]["lava-grid"]["map"].split()
     with torch.no_grad():
-        actions = load(run)(observations(rows)).argmax(dim=1).tolist()
+        seen = observations(rows, config["train"]["observation"])
+        actions = load(run)(seen).argmax(dim=1).tolist()
     if as_json:
         print(json.dumps(actions))
         return

@@ -127,7 +127,7 @@ fn weights(effort: (u32, Duration)) -> u64 {
     use lava_envs::LavaPoint;
     let options = trained::options();
     let game = trained::game(&options);
-    let fresh = || Pair::<LavaPoint>::new(&game);
+    let fresh = || Pair::<LavaPoint>::new(&trained::point(), &game);
     let valid = vec![fresh().weights("valid".into()).unwrap()];
     fuzz(&inputs(valid, "weights"), effort, |bytes| {
         let mut pair = fresh();

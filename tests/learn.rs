@@ -6,22 +6,27 @@ use cvar_game::game::finite::FiniteFamily;
 use cvar_game::game::gaussian::{GaussianFamily, MAX_BUMPS};
 use cvar_game::learn::adam::Adam;
 use cvar_game::learn::device::Device;
-use cvar_game::learn::head::{AntagonistHead, CategoricalPolicy, GaussianPolicy, Head};
+use cvar_game::learn::head::{AntagonistHead, CategoricalPolicy, GaussianPolicy, Head, PolicyHead};
+use cvar_game::learn::inputs::{Columns, Inputs};
 use cvar_game::learn::method::{Arena, Players, Progress, Setting, TrainError, Training};
 use cvar_game::learn::methods::game::{GameTraining, schedule};
-use cvar_game::learn::network::Outputs;
+use cvar_game::learn::network::{Network, Outputs, Shape};
+use cvar_game::learn::observation::Observation;
 use cvar_game::learn::options::{
-    Adversary, Credit, FamilyOptions, PlayerOptions, Role, TrainOptions,
+    Adversary, Credit, FamilyOptions, PlaneLaw, PlayerOptions, Role, TrainOptions, View,
 };
 use cvar_game::learn::pair::Pair;
+use cvar_game::learn::plane::DiscPolicy;
 use cvar_game::learn::play::{Play, Played, play};
-use cvar_game::learn::policy::{Draw, Mode, Nominal};
+use cvar_game::learn::policy::{Draw, Mode, Nominal, Situation};
 use cvar_game::learn::ppo::{Loss, Sample};
+use cvar_game::learn::rollout::{Collector, Terms};
 use cvar_game::learn::state::TrainingState;
+use lava_envs::action::Discrete;
 use lava_envs::law::{FiniteLaw, GaussianLaw};
 use lava_envs::{
-    ConfigError, End, Field, Force, GridConfig, LavaGrid, LavaPoint, Move, NoSuchState,
-    PointConfig, Scene, Step, World,
+    ConfigError, End, Field, FiniteModel, Force, GridConfig, LavaGrid, LavaPoint, Move,
+    NoSuchState, PointConfig, Scene, Step, World,
 };
 use nalgebra::Vector2;
 use rand::rngs::ChaCha8Rng;
@@ -53,13 +58,17 @@ fn options() -> TrainOptions {
         follower_updates: 2,
         leader: Role::Protagonist,
         credit: Credit::Chosen,
+        exploring_starts: 0.0,
+        exploring_until: 0.5,
         budget_wait: 0.0,
         budget_rise: 0.0,
         response: 0.0,
+        observation: View::Coordinates,
         adversary: Adversary::Learned,
         hide_budget: false,
         budget_sensitivity: true,
         protagonist: player(),
+        policy: PlaneLaw::Gaussian,
         initial_std: 1.0,
         antagonist: player(),
         family: FamilyOptions { kind: "auto".into(), count: 2, center: 4.0, curvature: 50.0 },
@@ -85,7 +94,8 @@ fn game(options: &TrainOptions, budget: f64) -> Setting<'_> {
 }
 
 fn fresh_pair<W: Arena>(options: &TrainOptions, budget: f64, seed: u64) -> Pair<W> {
-    Pair::new(&Setting { seed, ..game(options, budget) })
+    let world = W::new(&W::defaults(), 1).unwrap();
+    Pair::new(&world, &Setting { seed, ..game(options, budget) })
 }
 
 fn train<W: Arena>(
@@ -197,6 +207,10 @@ fn the_loss_gradient_equals_finite_differences_for_every_head() {
     });
     check_loss_gradient(&gaussian, &drawn, &constants, 2);
 
+    let disc = DiscPolicy { initial_std: 0.7 };
+    let drawn = samples(&disc, 12, &constants, |r| ((), disc.draw(&[0.0; 4], r)));
+    check_loss_gradient(&disc, &drawn, &constants, 5);
+
     let finite = AntagonistHead(FiniteFamily::<4>);
     let drawn = samples(&finite, 12, &[], |r| {
         let law = FiniteLaw { probabilities: [0.1, 0.2, 0.3, 0.4] };
@@ -215,6 +229,119 @@ fn the_loss_gradient_equals_finite_differences_for_every_head() {
         });
         check_loss_gradient(&sum, &drawn, &[], 4);
     }
+}
+
+/// A cell is what its one-hot code would be in its place: outputs and gradients of a network that takes it as
+/// an index are those of one that takes the code as numbers.
+#[test]
+fn a_cell_is_its_one_hot_code() {
+    let (cells, numbers, samples) = (7, 2, 45);
+    let shape = |columns| Shape { columns, hidden: 16, outputs: 3, constants: 0 };
+    let indexed = shape(Columns { cells, numbers });
+    let dense = shape(Columns { cells: 0, numbers: cells + numbers });
+    let mut random = ChaCha8Rng::seed_from_u64(4);
+    let parameters = Network::new(indexed, &[], Device::Cpu, &mut random).parameters().to_vec();
+    let (mut short, mut long) = (Inputs::default(), Inputs::default());
+    for _ in 0..samples {
+        let cell = random.random_range(0..cells);
+        let seen: [f32; 3] = [random.random_range(-1.0..1.0), random.random_range(-1.0..1.0), 1.0];
+        short.cells.push(cell as u32);
+        short.numbers.extend(seen);
+        long.numbers.extend((0..cells).map(|of| f32::from(u8::from(of == cell))));
+        long.numbers.extend(seen);
+    }
+    let run = |shape, inputs: &Inputs| {
+        let mut network = Network::from_parameters(shape, parameters.clone(), Device::Cpu);
+        let (mut outputs, mut values, mut gradient) = (Vec::new(), Vec::new(), Vec::new());
+        network.act(inputs.rows(), &mut outputs);
+        network.values(inputs.rows(), &mut values);
+        network.differentiate(inputs.rows(), &mut gradient, |block| {
+            for (i, y) in block.y.iter_mut().enumerate() {
+                *y *= (i % 5) as f32 - 1.5;
+            }
+        });
+        [outputs, values, gradient]
+    };
+    for (ours, theirs) in run(indexed, &short).into_iter().zip(run(dense, &long)) {
+        assert_eq!(ours.len(), theirs.len());
+        for (ours, theirs) in ours.iter().zip(&theirs) {
+            assert!((ours - theirs).abs() < 1e-5 * (1.0 + theirs.abs()), "{ours}, {theirs}");
+        }
+    }
+}
+
+/// What both players see as features: the cell, or cell and action together, and the waves of time and place.
+#[test]
+fn features_tell_states_and_actions_apart() {
+    let mut options = options();
+    options.observation = View::Features;
+    options.antagonist.time_aware = true;
+    let mut grid = LavaGrid::new(&GridConfig::default(), 3).unwrap();
+    for (slot, (cell, time)) in [(0, 0), (17, 10), (69, 39)].into_iter().enumerate() {
+        grid.place(slot, cell, time);
+    }
+    let observation = Observation::new(&grid, &options, eta(25.0));
+    let mut seen = Inputs::default();
+    observation.protagonist(&grid, &mut seen);
+    assert_eq!((&seen.cells[..], &seen.numbers[..]), (&[0, 17, 69][..], &[1.0; 3][..]));
+    let columns = Columns { cells: 70, numbers: 0 };
+    assert_eq!(observation.protagonist_columns::<LavaGrid>(), columns);
+    let actions = [Move::Up, Move::Left, Move::Down];
+    let laws: Vec<_> = actions.iter().enumerate().map(|(i, &a)| grid.law(i, a)).collect();
+    let budgets = [1.0, 5.0, 25.0].map(|budget| Budget::start(eta(budget)));
+    let situation = Situation { world: &grid, actions: &actions, laws: &laws, budgets: &budgets };
+    observation.antagonist(&situation, &mut seen);
+    let pairs: Vec<u32> =
+        [0, 17, 69].iter().zip(actions).map(|(cell, of)| 4 * cell + of.index() as u32).collect();
+    assert_eq!(seen.cells, pairs);
+    // log eta_t / log eta, the time with three octaves of waves, and the constant.
+    let width = observation.antagonist_columns::<LavaGrid>().numbers + 1;
+    assert_eq!(width, 1 + 7 + 1);
+    let row = &seen.numbers[width..2 * width];
+    assert!((row[0] - 0.5).abs() < 1e-6 && (row[1] + 0.5).abs() < 1e-6 && row[8] == 1.0, "{row:?}");
+    let phase = std::f32::consts::FRAC_PI_2 * 4.0 * 0.5;
+    assert!((row[6] - phase.sin()).abs() < 1e-6 && (row[7] - phase.cos()).abs() < 1e-6, "{row:?}");
+
+    let point = LavaPoint::new(&PointConfig::default(), 2).unwrap();
+    let observation = Observation::new(&point, &options, eta(25.0));
+    observation.protagonist(&point, &mut seen);
+    assert!(seen.cells.is_empty());
+    // Position and velocity, three octaves for each coordinate of the position, and the constant.
+    let row = &seen.numbers[..4 + 12 + 1];
+    assert_eq!(seen.numbers.len(), 2 * row.len());
+    for (axis, coordinate) in row[..2].iter().enumerate() {
+        let phase = std::f32::consts::FRAC_PI_2 * (coordinate + 1.0);
+        let waves = &row[4 + 6 * axis..][..6];
+        assert!((waves[0] - phase.sin()).abs() < 1e-6 && (waves[1] - phase.cos()).abs() < 1e-6);
+        assert!((waves[4] - (4.0 * phase).sin()).abs() < 1e-6, "{waves:?}");
+    }
+}
+
+/// Exploring starts fade out, are no part of what a run reports of its episodes, and keep the budget.
+#[test]
+fn exploring_starts_fade_out_and_are_not_reported() {
+    let mut options = options();
+    options.exploring_starts = 1.0;
+    options.exploring_until = 0.5;
+    options.steps = 8 * options.rollout();
+    let shares: Vec<f64> = schedule(&options, eta(4.0)).iter().map(|of| of.exploring).collect();
+    assert_eq!(shares, [1.0, 0.75, 0.5, 0.25, 0.0, 0.0, 0.0, 0.0]);
+    let setting = game(&options, 4.0);
+    let world = || LavaGrid::new(&GridConfig::default(), 50).unwrap();
+    let pair = Pair::new(&world(), &setting);
+    let mut collector = Collector::new(world(), &setting);
+    let terms = |exploring| Terms { eta: eta(4.0), mode: Mode::Sampled, exploring };
+    collector.collect(&pair, terms(1.0), &options);
+    assert!(collector.finished.is_empty() && collector.budget_use > 0.0);
+    assert!(collector.budget_use <= 1.0 + 1e-9);
+    // The first observations are spread over the map.
+    let first = &collector.protagonist.inputs.numbers[..50 * 3];
+    let columns: std::collections::BTreeSet<i32> =
+        first.chunks(3).map(|row| (row[0] * 100.0) as i32).collect();
+    assert!(columns.len() > 7, "{columns:?}");
+    collector.collect(&pair, terms(0.0), &options);
+    assert!(!collector.finished.is_empty());
+    assert!(collector.finished.iter().all(|episode| episode.steps <= 40));
 }
 
 /// 10,000 trajectories against antagonists with large random weights: the budget holds on each.
@@ -431,8 +558,7 @@ fn players_that_diverge_in_their_last_minibatch_are_diagnosed_before_they_play()
 }
 
 /// Trains with and without a break after every update, which goes through the bytes of a file.
-fn breaks_change_nothing<W: Arena>(budget: f64, world: impl Fn() -> W) {
-    let mut options = options();
+fn breaks_change_nothing<W: Arena>(mut options: TrainOptions, budget: f64, world: impl Fn() -> W) {
     options.parallel_episodes = 20;
     options.rollout_steps = 25; // episodes go on from rollout to rollout
     options.steps = 500 * 8;
@@ -457,9 +583,15 @@ fn breaks_change_nothing<W: Arena>(budget: f64, world: impl Fn() -> W) {
 
 #[test]
 fn training_goes_on_from_its_state_bit_for_bit() {
-    for budget in [1.0, 25.0] {
-        breaks_change_nothing(budget, || LavaGrid::new(&GridConfig::default(), 20).unwrap());
-        breaks_change_nothing(budget, || LavaPoint::new(&PointConfig::default(), 20).unwrap());
+    let plain = options();
+    let mut beyond = options();
+    (beyond.observation, beyond.policy) = (View::Features, PlaneLaw::Disc);
+    beyond.exploring_starts = 0.5;
+    for (options, budget) in [(&plain, 1.0), (&plain, 25.0), (&beyond, 25.0)] {
+        let grid = || LavaGrid::new(&GridConfig::default(), 20).unwrap();
+        breaks_change_nothing(options.clone(), budget, grid);
+        let point = || LavaPoint::new(&PointConfig::default(), 20).unwrap();
+        breaks_change_nothing(options.clone(), budget, point);
     }
 }
 

@@ -3,20 +3,20 @@
 use assert_cmd::Command;
 use cvar_game::experiment::config::RunConfig;
 use cvar_game::experiment::registry::standard;
+use cvar_game::learn::inputs::Inputs;
 use cvar_game::learn::method::Players;
 use cvar_game::learn::pair::Pair;
 use lava_envs::{FiniteModel, LavaGrid, World};
 use std::fs;
 
-#[test]
-#[ignore = "needs a Python with torch and safetensors: PYTHON=path, by default python3"]
-fn pytorch_finds_the_greedy_actions_of_every_cell() {
+/// With `view`, the network's own greedy action in every cell, and PyTorch's.
+fn compare(view: &str) {
     let out = tempfile::tempdir().unwrap();
     Command::cargo_bin("cvar-game")
         .unwrap()
         .args(["train", "--env", "lava-grid", "--eta", "25", "--seed", "1", "--steps", "100000"])
         .args(["--set", "evaluation.episodes=100", "--set", "evaluation.figure_episodes=100"])
-        .arg("--out")
+        .args(["--set", &format!("train.observation={view}"), "--out"])
         .arg(out.path())
         .assert()
         .success();
@@ -28,15 +28,13 @@ fn pytorch_finds_the_greedy_actions_of_every_cell() {
     let cells = LavaGrid::new(constants, 1).unwrap().cells();
     let mut world = LavaGrid::new(constants, cells).unwrap();
     (0..cells).for_each(|cell| world.place(cell, cell, 0));
-    let mut pair = Pair::<LavaGrid>::new(&run.setting());
+    let mut pair = Pair::new(&world, &run.setting());
     let bytes = fs::read(folder.join("final.safetensors")).unwrap();
     pair.load(&bytes).unwrap();
-    let mut inputs = vec![1.0; cells * (LavaGrid::OBSERVATION + 1)];
-    for (cell, row) in inputs.chunks_exact_mut(LavaGrid::OBSERVATION + 1).enumerate() {
-        world.observe(cell, &mut row[..LavaGrid::OBSERVATION]);
-    }
+    let mut inputs = Inputs::default();
+    pair.observation.protagonist(&world, &mut inputs);
     let mut outputs = Vec::new();
-    pair.protagonist.network.act(&inputs, &mut outputs);
+    pair.protagonist.network.act(inputs.rows(), &mut outputs);
     let greedy = |cell: usize| {
         let logit = |action: usize| outputs[action * cells + cell];
         (1..4).fold(0, |best, action| if logit(action) > logit(best) { action } else { best })
@@ -50,4 +48,11 @@ fn pytorch_finds_the_greedy_actions_of_every_cell() {
     assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
     let found: Vec<usize> = serde_json::from_slice(&output.stdout).unwrap();
     assert_eq!(found, expected);
+}
+
+#[test]
+#[ignore = "needs a Python with torch and safetensors: PYTHON=path, by default python3"]
+fn pytorch_finds_the_greedy_actions_of_every_cell() {
+    compare("coordinates");
+    compare("features");
 }

@@ -3,6 +3,7 @@
 #![cfg(feature = "torch")]
 
 use cvar_game::learn::device::Device;
+use cvar_game::learn::inputs::{Columns, Rows};
 use cvar_game::learn::network::{Network, Outputs, Shape};
 use rand::rngs::ChaCha8Rng;
 use rand::{RngExt, SeedableRng};
@@ -12,7 +13,8 @@ use tch::{Kind, Tensor};
 /// that mixes all of y.
 #[test]
 fn network_gradients_equal_autograd() {
-    let shape = Shape { inputs: 5, hidden: 16, outputs: 3, constants: 2 };
+    let columns = Columns { cells: 0, numbers: 5 };
+    let shape = Shape { columns, hidden: 16, outputs: 3, constants: 2 };
     let mut random = ChaCha8Rng::seed_from_u64(5);
     let mut network = Network::new(shape, &[0.2, -0.4], Device::Cpu, &mut random);
     // Not V, whose blocks beside the diagonal are zero for good.
@@ -47,7 +49,8 @@ fn network_gradients_equal_autograd() {
     let by_libtorch = Network::by_libtorch(shape, network.parameters().to_vec(), Device::Cpu);
     for mut network in [network, by_libtorch] {
         let (mut gradient, mut outputs) = (Vec::new(), vec![0.0; slopes.len()]);
-        network.differentiate(&inputs, &mut gradient, |Outputs { start, samples, y, stride }| {
+        let rows = Rows { cells: &[], numbers: &inputs };
+        network.differentiate(rows, &mut gradient, |Outputs { start, samples, y, stride }| {
             for (row, y) in y.chunks_exact_mut(stride).enumerate() {
                 for (i, y) in y[..samples].iter_mut().enumerate() {
                     let at = row * n + start + i;
@@ -66,8 +69,8 @@ fn network_gradients_equal_autograd() {
             assert!((ours - theirs).abs() < 1e-5, "{ours} against {theirs}");
         }
         let (mut acted, mut values) = (Vec::new(), Vec::new());
-        network.act(&inputs, &mut acted);
-        network.values(&inputs, &mut values);
+        network.act(rows, &mut acted);
+        network.values(rows, &mut values);
         for (one, other) in outputs.iter().zip(acted.iter().chain(&values)) {
             assert!((one - other).abs() < 1e-5, "actor and critic alone: {one} against {other}");
         }

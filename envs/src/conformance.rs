@@ -49,6 +49,7 @@ pub fn check<W: World>(constants: &W::Constants) {
     episodes::<W>(constants);
     slots_are_independent::<W>(constants);
     snapshots::<W>(constants);
+    scattered::<W>(constants);
     finite::<W>(constants);
 }
 
@@ -110,6 +111,33 @@ fn inside<W: World>(world: &W, slot: usize) {
     promise!(W, inside, "position {position:?} lies outside the scene of {:?}", scene.size);
 }
 
+/// A scattered slot is in a state from which an episode goes on, at a time in between; the same stream
+/// leads to the same state.
+fn scattered<W: World>(constants: &W::Constants) {
+    let mut world = create::<W>(constants, SLOTS);
+    let horizon = world.horizon();
+    let (mut one, mut other) = (chance(0), chance(0));
+    for _ in 0..20 {
+        for slot in 0..SLOTS {
+            world.scatter(slot, &mut one);
+            let (time, seen) = (world.time(slot), sight(&world, slot));
+            promise!(W, time < horizon, "scatter() leads to time {time} of {horizon}");
+            world.scatter((slot + 1) % SLOTS, &mut other);
+            let again = sight(&world, (slot + 1) % SLOTS);
+            promise!(W, seen == again, "scatter() depends on more than its stream");
+            inside(&world, slot);
+        }
+        let mut results = vec![Step::IDLE; SLOTS];
+        let (actions, outcomes): (Vec<_>, Vec<_>) =
+            (0..SLOTS).map(|slot| draw(&world, slot, &mut chance(slot))).unzip();
+        let times: Vec<u32> = (0..SLOTS).map(|slot| world.time(slot)).collect();
+        world.apply(&actions, &outcomes, &mut results);
+        for (slot, time) in times.into_iter().enumerate() {
+            promise!(W, world.time(slot) == time + 1, "scatter() leads to a state that is over");
+        }
+    }
+}
+
 /// Everything that can be seen of a slot, bit for bit.
 #[derive(Debug, Clone, PartialEq)]
 struct Sight {
@@ -139,6 +167,15 @@ fn observation<W: World>(world: &W, slot: usize) -> Vec<u32> {
             "entry {place} of the observation is {entry}: write every entry, about [-1, 1]"
         );
     }
+    let place = observation.get(..W::POSITIONS.min(W::SITUATION));
+    promise!(
+        W,
+        place.is_some_and(
+            |place| place.len() == W::POSITIONS && place.iter().all(|x| x.abs() <= 1.0)
+        ),
+        "POSITIONS is {}, but {observation:?} does not begin with so many coordinates in [-1, 1]",
+        W::POSITIONS
+    );
     observation.into_iter().map(f32::to_bits).collect()
 }
 

@@ -18,7 +18,7 @@ fn added() -> [(&'static str, &'static str, Value); 5] {
         ("train", "train.observation", "coordinates".into()),
         ("train", "train.policy", "gaussian".into()),
         ("train", "train.exploring_starts", 0.0.into()),
-        ("train", "train.exploring_until", 1.0.into()),
+        ("train", "train.exploring_until", 0.25.into()),
     ]
 }
 
