@@ -6,6 +6,7 @@
 //! | what is the law of J under a policy, with or without an antagonist | [`law`], [`policy`] |
 //! | what is the best attainable CVaR, V*(eta) | [`optimum`] |
 //! | what is the worst antagonist of a policy | [`antagonist`] |
+//! | what is the best response to an antagonist that no longer learns | [`response`] |
 //! | what would the budget-augmented programme report | [`chow`] |
 //! | how good can a policy without a clock be | [`stationary`] |
 //! | how far is a trained policy from the optimum | [`certificate`] |
@@ -27,6 +28,7 @@ pub mod mdp;
 pub mod optimum;
 pub mod oracle;
 pub mod policy;
+pub mod response;
 pub mod stationary;
 pub mod table;
 pub mod watch;

@@ -34,11 +34,13 @@ use super::mdp::FiniteMdp;
 use super::optimum::Optimum;
 use super::oracle::{self, Certified, Effort, OracleError};
 use super::require_eta;
+use super::response::{self, Frozen, Response};
+use super::stationary;
 use super::table::TablePolicy;
 use super::watch::Watch;
 use crate::game::returns::ReturnLaw;
 use lava_envs::{LavaGrid, LavaPoint, PointConfig, World};
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 use std::fmt::Display;
 use std::sync::{Arc, Mutex};
 
@@ -83,7 +85,11 @@ pub fn exactly<W: World>(
     gamma: f64,
 ) -> Result<Option<Box<dyn Yardstick>>, YardstickError> {
     match ExactWorld::<W>::new(constants, gamma) {
-        Ok(world) => Ok(Some(Box::new(Exact { world, solved: Mutex::default() }))),
+        Ok(world) => Ok(Some(Box::new(Exact {
+            world,
+            solved: Mutex::default(),
+            stationary: Mutex::default(),
+        }))),
         Err(ExactError::NotFinite(_)) => Ok(None),
         Err(error) => Err(error.into()),
     }
@@ -134,6 +140,9 @@ pub struct Evidence<'a> {
     /// The law of the greedy policy's return against its antagonist, from recorded episodes; `None`
     /// where it has none.
     pub opposed: Option<&'a ReturnLaw>,
+    /// The best response to its antagonist, from [`ExactYardstick::best_response`]; at eta = 1, where no
+    /// antagonist can do anything, it need not be given.
+    pub response: Option<Response>,
 }
 
 /// A policy compared with the best.
@@ -151,6 +160,38 @@ pub struct Comparison {
     pub antagonist_gap: f64,
     /// Standard error of `antagonist_gap`.
     pub antagonist_gap_standard_error: f64,
+    /// The best CVaR_{1/eta} that is found for a stationary deterministic policy
+    /// ([`super::stationary`]) minus that of the greedy policy, where that does not see the time. The best one
+    /// there is may be better than the best one found, and so may the policy: then this is negative.
+    pub class_regret: Option<f64>,
+    /// How far the policy and its antagonist are from an equilibrium; `None` where the best response to the
+    /// antagonist is not known.
+    pub exploitability: Option<Exploitability>,
+}
+
+/// How much the better deviation of one player improves on V*(eta), in the sense of the paper's Definition 2:
+///
+///   epsilon = max(V* - CVaR_{1/eta} of the greedy policy, best response to the antagonist - V*).
+///
+/// The first half is the regret: the least mean return of a deterministic policy over all antagonists is its
+/// CVaR_{1/eta}. The second half is an upper bound, because the best response may see the remaining budget.
+/// Neither is negative up to rounding and, for the second, `response_error`.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct Exploitability {
+    /// The larger half.
+    pub epsilon: f64,
+    /// The second half: what the best response to the antagonist gains over V*(eta).
+    pub response_gain: f64,
+    /// Estimate of the numerical error of `response_gain`.
+    pub response_error: f64,
+}
+
+impl Exploitability {
+    fn new(optimum: f64, regret: f64, response: Response) -> Self {
+        let response_gain = response.value - optimum;
+        let epsilon = regret.max(response_gain);
+        Exploitability { epsilon, response_gain, response_error: response.error }
+    }
 }
 
 /// The answer to a question: a page for people by [`Display`], JSON for programs.
@@ -218,6 +259,17 @@ pub trait ExactYardstick: Send + Sync {
     /// If the budget is out of range or the policy does not fit the world.
     fn regret(&self, eta: f64, policy: &TablePolicy) -> Result<f64, ExactError>;
 
+    /// The best response to an antagonist that no longer learns, whose budget is eta. `None` if the antagonist
+    /// does not give its ratios or the world is too large ([`response::best_response`]).
+    ///
+    /// # Errors
+    /// If the budget is out of range.
+    fn best_response(
+        &self,
+        eta: f64,
+        antagonist: &mut dyn Frozen,
+    ) -> Result<Option<Response>, ExactError>;
+
     /// The exact worst-case antagonist of the greedy policy, to play against.
     ///
     /// # Errors
@@ -272,6 +324,8 @@ struct Exact<W> {
     world: ExactWorld<W>,
     /// By budget.
     solved: Mutex<Vec<(f64, Arc<Optimum>)>>,
+    /// CVaR of the best stationary policy that was found, by budget.
+    stationary: Mutex<Vec<(f64, f64)>>,
 }
 
 impl<W: World> Exact<W> {
@@ -287,6 +341,18 @@ impl<W: World> Exact<W> {
         let optimum = Arc::new(self.world.optimum(eta)?);
         solved.push((eta, Arc::clone(&optimum)));
         Ok(optimum)
+    }
+
+    /// CVaR_{1/eta} of the best stationary policy found.
+    fn stationary(&self, eta: f64) -> Result<f64, ExactError> {
+        let optimum = self.optimum(eta)?;
+        let mut found = self.stationary.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
+        if let Some((_, cvar)) = found.iter().find(|(of, _)| *of == eta) {
+            return Ok(*cvar);
+        }
+        let cvar = stationary::search(self.mdp(), require_eta(eta)?, &optimum.policy)?.cvar;
+        found.push((eta, cvar));
+        Ok(cvar)
     }
 }
 
@@ -306,7 +372,11 @@ impl<W: World> Yardstick for Exact<W> {
     ) -> Result<Option<Comparison>, YardstickError> {
         let Some(policy) = evidence.policy else { return Ok(None) };
         let sampled = policy.on(&self.world)?;
-        let found = self.world.certificate(&*self.optimum(eta)?, &sampled, eta)?;
+        let optimum = self.optimum(eta)?;
+        let found = self.world.certificate(&optimum, &sampled, eta)?;
+        let class = if policy.sees_time() { None } else { Some(self.stationary(eta)?) };
+        let neutral = Response { value: optimum.cvar, error: 0.0 };
+        let response = evidence.response.or((eta == 1.0).then_some(neutral));
         let (antagonist_gap, antagonist_gap_standard_error) =
             evidence.opposed.map_or((0.0, 0.0), |law| {
                 (found.antagonist_gap(law.mean()), law.mean_standard_error())
@@ -317,6 +387,9 @@ impl<W: World> Yardstick for Exact<W> {
             regret_standard_error: 0.0,
             antagonist_gap,
             antagonist_gap_standard_error,
+            class_regret: class.map(|best| best - found.greedy.cvar),
+            exploitability: response
+                .map(|response| Exploitability::new(found.optimal_cvar, found.regret, response)),
         }))
     }
 
@@ -339,6 +412,14 @@ impl<W: World> ExactYardstick for Exact<W> {
         let alpha = require_eta(eta)?;
         let greedy = policy.on(&self.world)?.greedy(self.mdp());
         Ok(self.optimum(eta)?.cvar - evaluate(self.mdp(), &greedy).law.cvar(alpha))
+    }
+
+    fn best_response(
+        &self,
+        eta: f64,
+        antagonist: &mut dyn Frozen,
+    ) -> Result<Option<Response>, ExactError> {
+        response::best_response(self.mdp(), eta, antagonist)
     }
 
     fn worst_case(
@@ -446,6 +527,8 @@ impl Yardstick for Oracle {
             regret_standard_error: error.hypot(oracle.law.cvar_standard_error(alpha)),
             antagonist_gap,
             antagonist_gap_standard_error: value_error.map_or(0.0, |value| value.hypot(error)),
+            class_regret: None,
+            exploitability: None,
         }))
     }
 }

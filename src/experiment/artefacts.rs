@@ -14,7 +14,7 @@
 //! | `evaluation.json` | [`Evaluation`]; written last, so that a run with it is finished |
 
 use super::names::RunId;
-use crate::exact::yardstick::Comparison;
+use crate::exact::yardstick::{Comparison, Exploitability};
 use crate::game::returns::ReturnLaw;
 use crate::learn::policy::Mode;
 use serde::{Deserialize, Serialize};
@@ -148,6 +148,14 @@ pub struct Certificate {
     pub antagonist_gap: f64,
     /// Standard error of `antagonist_gap`; 0 where that is exact.
     pub antagonist_gap_standard_error: f64,
+    /// CVaR_{1/eta} of the best stationary policy found, minus that of the greedy policy; `None` where that sees
+    /// the time, where the world is not finite, and in files of former versions.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub class_regret: Option<f64>,
+    /// How far both players are from an equilibrium; `None` where the best response to the antagonist is not
+    /// known, and in files of former versions.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub exploitability: Option<Exploitability>,
 }
 
 impl From<Comparison> for Certificate {
@@ -158,6 +166,8 @@ impl From<Comparison> for Certificate {
             regret_standard_error: found.regret_standard_error,
             antagonist_gap: found.antagonist_gap,
             antagonist_gap_standard_error: found.antagonist_gap_standard_error,
+            class_regret: found.class_regret,
+            exploitability: found.exploitability,
         }
     }
 }

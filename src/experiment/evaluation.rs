@@ -12,6 +12,7 @@
 use super::artefacts::{Audit, Certificate, Chance, Findings, Play};
 use super::config::RunConfig;
 use super::failure::RunError;
+use super::frozen::FrozenOpponent;
 use crate::exact::table::TablePolicy;
 use crate::exact::yardstick::{Evidence, Ratios, Solvable, Yardstick};
 use crate::game::returns::ReturnSoFar;
@@ -193,10 +194,18 @@ impl<W: Arena + Solvable> Contestants<'_, W> {
             let wanted = |play: &&Play| play.protagonist == Mode::Greedy && play.chance == chance;
             plays.iter().find(wanted).map(|play| &play.law)
         };
+        let response = match (yardstick.exact(), self.players.opponent()) {
+            (Some(exact), Some(mut opponent)) => {
+                let mut frozen = FrozenOpponent::new(self.constants, opponent.as_mut())?;
+                exact.best_response(self.run.eta.get(), &mut frozen)?
+            }
+            _ => None,
+        };
         let evidence = Evidence {
             policy: policy.as_ref(),
             nominal: greedy(Chance::Nominal),
             opposed: greedy(Chance::Antagonist),
+            response,
         };
         let found = yardstick.compare(self.run.eta.get(), &evidence)?;
         Ok(found.map(Certificate::from))

@@ -19,6 +19,7 @@ pub mod config;
 pub mod evaluation;
 pub mod failure;
 pub mod figure_data;
+pub mod frozen;
 pub mod growing_file;
 pub mod lock;
 pub mod names;

@@ -162,6 +162,10 @@ pub trait Antagonist<L: Law>: Debug + Send {
     /// Draws outcomes from perturbed laws.
     fn reweight(&self, of: Reweighting<'_, L>);
 
+    /// The likelihood ratios of all outcomes, shape `[slots, outcomes]`, from actor outputs of shape
+    /// `[k, slots]`; `None` where outcomes are not finitely many.
+    fn all_ratios(&self, outputs: &[f32], laws: &[L], budgets: &[Budget]) -> Option<Vec<f64>>;
+
     /// How its own spending changes its value along the recorded trajectories. `with_more_budget` turns inputs
     /// into those that it would see with exp(the second argument) times the budget.
     fn budget_sensitivity(
@@ -230,6 +234,18 @@ impl<F: Family + Send + 'static> Antagonist<F::Law> for Player<AntagonistHead<F>
         if let Some(largest) = of.normalisation_error {
             *largest = largest.max(error);
         }
+    }
+
+    fn all_ratios(&self, outputs: &[f32], laws: &[F::Law], budgets: &[Budget]) -> Option<Vec<f64>> {
+        let all = || (0..).map_while(<F::Law as Law>::outcome);
+        all().next()?;
+        let (mut parameters, mut ratios) = (Vec::new(), Vec::new());
+        for (slot, (law, &budget)) in laws.iter().zip(budgets).enumerate() {
+            self.parameters_in(outputs, slot, &mut parameters);
+            let perturbation = self.head.0.perturbation(&parameters, law, budget);
+            ratios.extend(all().map(|outcome| perturbation.likelihood_ratio(outcome)));
+        }
+        Some(ratios)
     }
 
     fn budget_sensitivity(

@@ -96,6 +96,9 @@ pub trait HeadOf<A: Action> {
 
     /// Position of an action among finitely many; 0 for any other.
     fn index(action: A) -> usize;
+
+    /// The action of a position, where actions are finitely many and it is one of theirs.
+    fn from_index(index: usize) -> Option<A>;
 }
 
 impl<A: Discrete> HeadOf<A> for Finite {
@@ -107,6 +110,10 @@ impl<A: Discrete> HeadOf<A> for Finite {
 
     fn index(action: A) -> usize {
         action.index()
+    }
+
+    fn from_index(index: usize) -> Option<A> {
+        (index < A::COUNT).then(|| A::from_index(index))
     }
 }
 

@@ -69,6 +69,11 @@ impl Observation {
         self.protagonist_time
     }
 
+    /// Whether the antagonist sees the time.
+    pub fn antagonist_sees_time(&self) -> bool {
+        self.antagonist_time
+    }
+
     /// Sizes of what the protagonist sees.
     pub fn protagonist_columns<W: World>(&self) -> Columns {
         let numbers = self.place_columns::<W>(W::OBSERVATION);

@@ -217,6 +217,19 @@ impl<W: Arena> Opponent<W> for LearnedOpponent<'_, W> {
         });
     }
 
+    fn all_ratios(&mut self, situation: &Situation<'_, W>) -> Option<Vec<f64>> {
+        if self.pair.adversary == Adversary::Random {
+            return None;
+        }
+        self.look(situation);
+        self.antagonist.network().act(self.inputs.rows(), &mut self.outputs);
+        self.antagonist.all_ratios(&self.outputs, situation.laws, situation.budgets)
+    }
+
+    fn sees_time(&self) -> bool {
+        self.pair.observation.antagonist_sees_time()
+    }
+
     fn normalisation_error(&self) -> f64 {
         self.normalisation_error.unwrap_or(0.0)
     }

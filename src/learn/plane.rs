@@ -179,6 +179,10 @@ impl HeadOf<Force> for Plane {
     fn index(_: Force) -> usize {
         0
     }
+
+    fn from_index(_: usize) -> Option<Force> {
+        None
+    }
 }
 
 /// Asks the policy that is selected.

@@ -88,6 +88,18 @@ pub trait Opponent<W: World> {
         response: Response<'_, W>,
     );
 
+    /// The likelihood ratios delta_t of all outcomes in every slot, shape `[slots, outcomes]`, where outcomes
+    /// are finitely many and the ratios follow from the situation. Best responses need them.
+    fn all_ratios(&mut self, situation: &Situation<'_, W>) -> Option<Vec<f64>> {
+        let _ = situation;
+        None
+    }
+
+    /// Whether its ratios depend on the time.
+    fn sees_time(&self) -> bool {
+        true
+    }
+
     /// max |`E_P[delta_t]` - 1| over all perturbations so far, for the budget audit.
     fn normalisation_error(&self) -> f64 {
         0.0
