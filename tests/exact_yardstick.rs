@@ -5,9 +5,11 @@ use cvar_game::exact::finite::ExactWorld;
 use cvar_game::exact::law::evaluate;
 use cvar_game::exact::oracle::{self, Effort};
 use cvar_game::exact::policy::Policy;
+use cvar_game::exact::response::Response;
+use cvar_game::exact::stationary;
 use cvar_game::exact::table::TablePolicy;
 use cvar_game::exact::yardstick::{
-    Evidence, ExactYardstick, Options, Solvable, Source, Yardstick, YardstickError,
+    Evidence, ExactYardstick, Exploitability, Options, Solvable, Source, Yardstick, YardstickError,
 };
 use lava_envs::{GridConfig, LavaGrid, LavaPoint, PointConfig, World};
 
@@ -73,7 +75,8 @@ fn the_grid_is_measured_exactly() {
     let best = grid.optimum(ETA).unwrap();
     let certificate = grid.certificate(&best, &policy, ETA).unwrap();
     let opposed = best.evaluation.law.clone(); // any law
-    let evidence = Evidence { policy: Some(&table), opposed: Some(&opposed), nominal: None };
+    let evidence =
+        Evidence { policy: Some(&table), opposed: Some(&opposed), ..Evidence::default() };
     let found = yardstick.compare(ETA, &evidence).unwrap().unwrap();
     assert_eq!(found.optimum, best.cvar);
     assert_eq!(found.regret, certificate.regret);
@@ -88,6 +91,43 @@ fn the_grid_is_measured_exactly() {
     let laws = exact.laws(&table).unwrap();
     assert_eq!((laws.greedy, laws.sampled), (certificate.greedy_law, certificate.sampled_law));
     assert!(matches!(exact.regret(0.5, &table), Err(ExactError::Eta(_))));
+}
+
+/// A policy that does not see the time is compared with the best one found of its kind, and both halves of
+/// exploitability are about the best of all.
+#[test]
+fn class_regret_and_exploitability_are_about_the_class_and_about_all() {
+    let (grid, yardstick) = (grid(), yardstick());
+    for eta in [1.0, ETA] {
+        let best = grid.optimum(eta).unwrap();
+        let found = stationary::search(grid.mdp(), 1.0 / eta, &best.policy).unwrap();
+        let row = |cell: usize| {
+            let mut row = vec![0.0; 4];
+            if grid.mdp().ended(cell).is_none() {
+                row[found.policy.action(grid.mdp(), grid.node(0, cell))] = 1.0;
+            }
+            row
+        };
+        let table = TablePolicy::from_fn([70, 4], None, |_, cell| row(cell));
+        let response = Response { value: best.cvar + 0.003, error: 1e-5 };
+        let evidence = Evidence { policy: Some(&table), ..Evidence::default() };
+        let compared = yardstick.compare(eta, &evidence).unwrap().unwrap();
+        assert_eq!(compared.class_regret, Some(0.0));
+        assert_eq!(compared.regret, best.cvar - found.cvar);
+        // At eta = 1 the antagonist can do nothing, whatever it is.
+        let neutral =
+            Exploitability { epsilon: compared.regret, response_gain: 0.0, response_error: 0.0 };
+        assert_eq!(compared.exploitability, (eta == 1.0).then_some(neutral));
+        let evidence = Evidence { response: Some(response), ..evidence };
+        let both = yardstick.compare(eta, &evidence).unwrap().unwrap().exploitability.unwrap();
+        assert_eq!(both.response_gain, response.value - best.cvar);
+        assert_eq!(both.epsilon, compared.regret.max(both.response_gain));
+        assert_eq!(both.response_error, 1e-5);
+    }
+    // One that sees the time is of no such class.
+    let (table, _) = careless(&grid);
+    let evidence = Evidence { policy: Some(&table), ..Evidence::default() };
+    assert_eq!(yardstick.compare(ETA, &evidence).unwrap().unwrap().class_regret, None);
 }
 
 #[test]
@@ -152,7 +192,7 @@ fn lava_point_is_measured_by_its_oracle() {
     let law = yardstick.optimal_law(ETA).unwrap().unwrap();
     assert_eq!(law, certified.law);
     // The oracle's own episodes as those of a policy.
-    let evidence = Evidence { nominal: Some(&law), opposed: Some(&law), policy: None };
+    let evidence = Evidence { nominal: Some(&law), opposed: Some(&law), ..Evidence::default() };
     let found = yardstick.compare(ETA, &evidence).unwrap().unwrap();
     let error = law.cvar_standard_error(1.0 / ETA);
     assert_eq!(found.optimum, certified.certified_cvar);

@@ -1,5 +1,6 @@
 //! Tables from synthetic results folders with known answers.
 
+use cvar_game::exact::yardstick::Exploitability;
 use cvar_game::experiment::archive;
 use cvar_game::experiment::artefacts::{
     Audit, Certificate, Chance, Evaluation, Manifest, Play, SCHEMA,
@@ -132,12 +133,20 @@ fn realistic_of(dir: &Path, seeds: u64) {
                     weighted_nominal_standard_error: 0.01,
                 });
             }
+            let regret = optimum - law(lava).cvar(1.0 / eta);
+            let response_gain = if eta > 1.0 { 0.02 + 0.001 * seed as f64 } else { 0.0 };
             let certificate = Certificate {
                 optimum,
-                regret: optimum - law(lava).cvar(1.0 / eta),
+                regret,
                 antagonist_gap: gap,
                 regret_standard_error: 0.0,
                 antagonist_gap_standard_error: if eta > 1.0 { 0.002 } else { 0.0 },
+                class_regret: Some(regret - 0.001),
+                exploitability: Some(Exploitability {
+                    epsilon: regret.max(response_gain),
+                    response_gain,
+                    response_error: 1e-5,
+                }),
             };
             let mut run = evaluation("lava-grid", eta, seed, plays);
             (run.audit, run.certificate) = (audit, Some(certificate));
@@ -243,6 +252,12 @@ fn numbers_of_a_run_are_the_known_ones() {
         antagonist_gap: -1e-12,
         regret_standard_error: 0.0,
         antagonist_gap_standard_error: 0.0,
+        class_regret: Some(-0.25),
+        exploitability: Some(Exploitability {
+            epsilon: 1.75,
+            response_gain: 1.75,
+            response_error: 0.125,
+        }),
     });
     store(dir.path(), &run);
     report::write(dir.path(), standard(), WIDTH).unwrap();
@@ -268,6 +283,10 @@ fn numbers_of_a_run_are_the_known_ones() {
         ("bound_slack", "0.985000"),
         ("regret", "1.500000"),
         ("antagonist_gap", "0.000000"),
+        ("class_regret", "-0.250000"),
+        ("response_gain", "1.750000"),
+        ("response_error", "0.125000"),
+        ("exploitability", "1.750000"),
         ("budget_use", ""),
         ("budget_violations", ""),
     ] {

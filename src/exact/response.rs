@@ -12,8 +12,8 @@
 //! not be known: worlds with several levels of it are no harder.
 //!
 //! # The grid of budgets
-//! V is kept at [`BUDGETS`] values of b = log eta_t and is linear in b between them: evenly spaced nodes
-//! from 0 to log eta, and from there to log eta + log [`HEADROOM`].
+//! V is kept at [`BUDGETS`] values of b = log eta_t, from 0 to log eta + log [`HEADROOM`], and is linear in b
+//! between them. They are dense up to a little above log eta, where most episodes stay.
 //!
 //! A budget rises when a ratio below 1 is realised, without bound. But with L_t the product of the ratios so
 //! far, eta_t = eta / L_t, and 1/L_t is a supermartingale of mean at most 1 under the perturbed law, whatever
@@ -21,20 +21,28 @@
 //! 1/[`HEADROOM`]. What leaves it counts with the best return that the world can give from there. So this
 //! error is on the upper side, and at most the range of the returns divided by [`HEADROOM`].
 //!
-//! The error of the interpolation has no sign that is known. [`Response::error`] estimates it: the difference to
-//! the value on the grid with every other node, three times the error where that falls with the square of the
-//! distance of nodes.
+//! The error of the interpolation has no sign that is known. [`Response::error`] estimates it by the difference to
+//! the value on the grid with every other node, which is the error itself where that falls with the distance of
+//! the nodes, and three times the error where it falls with the square of it.
+//!
+//! # How small it can be
+//! At every node the best response is worth at least max_a min_delta of the same sum, which is the programme of
+//! [`super::chow`]. So V_0(s_0, eta) is at least the value of that programme for any admissible antagonist, also
+//! for a perfect one. Where Chow's value exceeds V*(eta), no antagonist has a second half of 0.
 
 use super::mdp::FiniteMdp;
 use super::optimum::optimum;
 use super::{ExactError, require_eta};
 
-/// Steps of the grid from budget 1 to eta, and from there to its end. Even, so that every other node is a
-/// grid, too.
-const STEPS: [usize; 2] = [128, 128];
+/// Even steps of the grid from log eta_t = 0 to log eta, from there to log eta + [`NEAR`], and from there to its
+/// end. Even numbers of them, so that every other node is a grid, too.
+const STEPS: [usize; 3] = [128, 128, 64];
+
+/// Length of the grid's second part. At most one episode in twenty leaves it.
+const NEAR: f64 = 3.0;
 
 /// Budgets at which an antagonist is asked.
-pub const BUDGETS: usize = STEPS[0] + STEPS[1] + 1;
+pub const BUDGETS: usize = STEPS[0] + STEPS[1] + STEPS[2] + 1;
 
 /// How many times eta the largest budget of the grid is.
 pub const HEADROOM: f64 = 1e6;
@@ -97,8 +105,9 @@ pub fn best_response(
 
 /// The value on the whole grid and on that with every other node.
 fn programme(mdp: &FiniteMdp, eta: f64, antagonist: &mut dyn Frozen) -> Option<[f64; 2]> {
-    let mut layers = [1, 2].map(|stride| Layer::new(mdp, Grid::new(eta, stride)));
-    let budgets: Vec<f64> = layers[0].grid.budgets().collect();
+    let mut layers = [1, 2].map(|stride| Layer::new(mdp, eta, stride));
+    let whole = layers[0].grid;
+    let budgets: Vec<f64> = (0..BUDGETS).map(|node| whole.log(node).exp()).collect();
     let mut best = vec![0.0; mdp.states()];
     let mut ratios = Vec::new();
     for time in (0..mdp.horizon()).rev() {
@@ -117,7 +126,7 @@ fn programme(mdp: &FiniteMdp, eta: f64, antagonist: &mut dyn Frozen) -> Option<[
         layers.iter_mut().for_each(|layer| layer.back(mdp, &best));
         best = best_returns(mdp, &best);
     }
-    Some(layers.map(|layer| layer.values[mdp.start() * layer.grid.len() + layer.grid.steps[0]]))
+    Some(layers.map(|layer| layer.values[mdp.start() * layer.grid.len() + layer.grid.eta()]))
 }
 
 /// States in which the episode continues, with their actions.
@@ -141,51 +150,63 @@ fn best_returns(mdp: &FiniteMdp, after: &[f64]) -> Vec<f64> {
     best
 }
 
-/// Values of b = log eta_t.
+/// Values of b = log eta_t: some even steps after others.
 #[derive(Debug, Clone, Copy)]
 struct Grid {
-    log_eta: f64,
-    /// Steps from 0 to log eta, and from there to the end.
-    steps: [usize; 2],
-    /// Their lengths.
-    lengths: [f64; 2],
+    parts: [Part; 3],
+}
+
+#[derive(Debug, Clone, Copy)]
+struct Part {
+    /// Number of its first node.
+    first: usize,
+    /// b there.
+    start: f64,
+    /// Steps, and the length of each.
+    steps: usize,
+    length: f64,
 }
 
 impl Grid {
     /// The grid with every `stride`-th node.
     fn new(eta: f64, stride: usize) -> Self {
-        let steps = STEPS.map(|steps| steps / stride);
-        let lengths = [eta.ln() / steps[0] as f64, HEADROOM.ln() / steps[1] as f64];
-        Grid { log_eta: eta.ln(), steps, lengths }
+        let (mut first, mut start) = (0, 0.0);
+        let ends = [eta.ln(), eta.ln() + NEAR, eta.ln() + HEADROOM.ln()];
+        let parts = std::array::from_fn(|part| {
+            let steps = STEPS[part] / stride;
+            let length = (ends[part] - start) / steps as f64;
+            let this = Part { first, start, steps, length };
+            (first, start) = (first + steps, ends[part]);
+            this
+        });
+        Grid { parts }
     }
 
     fn len(&self) -> usize {
-        self.steps[0] + self.steps[1] + 1
+        let [.., last] = self.parts;
+        last.first + last.steps + 1
     }
 
-    /// eta_t at every node.
-    fn budgets(self) -> impl Iterator<Item = f64> {
-        (0..self.len()).map(move |node| self.log(node).exp())
+    /// The node of log eta.
+    fn eta(&self) -> usize {
+        self.parts[1].first
     }
 
     fn log(&self, node: usize) -> f64 {
-        match node.checked_sub(self.steps[0]) {
-            None => node as f64 * self.lengths[0],
-            Some(above) => self.log_eta + above as f64 * self.lengths[1],
-        }
+        let inside = |part: &&Part| node >= part.first;
+        let part = self.parts.iter().rev().find(inside).expect("the first part begins at 0");
+        part.start + (node - part.first) as f64 * part.length
     }
 
     /// The node below a value and the share of the next one; `None` beyond the end.
     fn place(&self, log: f64) -> Option<(u32, f64)> {
-        let (first, steps, part) = if log < self.log_eta {
-            (0, self.steps[0], log.max(0.0) / self.lengths[0])
-        } else {
-            (self.steps[0], self.steps[1], (log - self.log_eta) / self.lengths[1])
-        };
-        // The last node has none above it; rounding may lead a little beyond it.
-        let below = (part as usize).min(steps - 1);
-        let share = part - below as f64;
-        (share <= 1.0 + 1e-9).then_some(((first + below) as u32, share.min(1.0)))
+        let inside = |part: &&Part| log >= part.start;
+        let part = self.parts.iter().rev().find(inside).unwrap_or(&self.parts[0]);
+        // Rounding may lead a little below 0 or beyond the end.
+        let steps = ((log - part.start) / part.length).max(0.0);
+        let below = (steps as usize).min(part.steps - 1);
+        let share = steps - below as f64;
+        (share <= 1.0 + 1e-9).then_some(((part.first + below) as u32, share.min(1.0)))
     }
 }
 
@@ -211,9 +232,9 @@ struct Layer {
 }
 
 impl Layer {
-    fn new(mdp: &FiniteMdp, grid: Grid) -> Self {
+    fn new(mdp: &FiniteMdp, eta: f64, stride: usize) -> Self {
+        let grid = Grid::new(eta, stride);
         let values = vec![0.0; mdp.states() * grid.len()];
-        let stride = STEPS[0] / grid.steps[0];
         Layer { grid, stride, steps: Vec::new(), earlier: values.clone(), values }
     }
 

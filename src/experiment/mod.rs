@@ -8,6 +8,7 @@
 //! | how are they carried out, many at a time | [`runner`] |
 //! | which files does a run write | [`artefacts`], [`figure_data`], [`tensorboard`] |
 //! | where are the files of finished runs | [`archive`] |
+//! | what is a trained opponent to an exact solver | [`frozen`] |
 //! | what does an unfinished one continue from | [`checkpoint`] |
 //! | who may work on a run, and what stops it | [`lock`], [`stop`] |
 //! | how is a sweep submitted to Slurm | [`slurm`] |

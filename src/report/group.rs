@@ -50,6 +50,12 @@ pub struct Measures {
     pub regret: Option<f64>,
     /// Greedy game value - CVaR_{1/eta}.
     pub antagonist_gap: Option<f64>,
+    /// CVaR_{1/eta} of the best stationary policy found - CVaR_{1/eta}; exact.
+    pub class_regret: Option<f64>,
+    /// Best response to the antagonist - V*(eta); exact.
+    pub response_gain: Option<f64>,
+    /// The larger one of the regret and the response gain.
+    pub exploitability: Option<f64>,
 }
 
 /// The four laws of the return that a run is measured by.
@@ -125,6 +131,8 @@ impl Measures {
         let rate = |end| greedy.map(|law| law.probability(end));
         let sampled_cvar = laws.sampled.as_ref().and_then(|law| cvar(law, run.alpha()));
         let game_value = laws.game.as_ref().map(ReturnLaw::mean);
+        let certificate = run.evaluation.as_ref().and_then(|evaluation| evaluation.certificate);
+        let exploitability = certificate.and_then(|of| of.exploitability);
         Measures {
             absent: run.evaluation.is_none(),
             mean: greedy.map(ReturnLaw::mean),
@@ -141,6 +149,9 @@ impl Measures {
             greedy_game_value: laws.greedy_game.as_ref().map(ReturnLaw::mean),
             regret,
             antagonist_gap,
+            class_regret: certificate.and_then(|of| of.class_regret),
+            response_gain: exploitability.map(|of| of.response_gain),
+            exploitability: exploitability.map(|of| of.epsilon),
         }
     }
 }

@@ -394,7 +394,8 @@ fn escaped(text: &str) -> String {
 
 /// CSV: `env,eta,alpha,seeds,failures` (after `folder` or `method`, if there are several), then every
 /// column by its key; an estimate has `KEY`, `KEY_lo` and `KEY_hi`, the worst seed `KEY` and `KEY_seed`.
-/// Rates are fractions. Six decimals; empty where there is no number.
+/// Rates are fractions. Six decimals; empty where there is no number. A few columns are left out where no row
+/// has a number ([`Table::lists`]).
 pub struct Csv;
 
 impl Render for Csv {
@@ -403,7 +404,8 @@ impl Render for Csv {
         if let Some(heading) = table.heading {
             header.insert(0, heading.to_owned());
         }
-        for Column { key, format, .. } in &COLUMNS {
+        let listed = || COLUMNS.iter().enumerate().filter(|(place, _)| table.lists(*place));
+        for (_, Column { key, format, .. }) in listed() {
             header.push((*key).to_owned());
             match format {
                 Format::Count => {}
@@ -425,7 +427,8 @@ impl Render for Csv {
                 if table.heading.is_some() {
                     fields.insert(0, row.name.clone());
                 }
-                for (column, &cell) in COLUMNS.iter().zip(&row.cells) {
+                for (place, column) in listed() {
+                    let cell = row.cells[place];
                     let width = match column.format {
                         Format::Count => 1,
                         Format::Worst(_) => 2,

@@ -29,7 +29,8 @@
 //!
 //! `runs.csv`, ordered by method, variant, world, eta and seed; alpha = 1/eta; numbers with six decimals; an empty
 //! field is a number that does not exist (say, a certificate where the world has no yardstick) or a
-//! CVaR whose tail holds fewer than ten recorded episodes:
+//! CVaR whose tail holds fewer than ten recorded episodes. The columns from `class_regret` to `exploitability`
+//! are left out where no run has one of them, as in results of former versions:
 //!
 //! | column | meaning |
 //! |---|---|
@@ -50,11 +51,15 @@
 //! | `bound_slack` | `game_value - sampled_cvar`, not below 0 but for sampling error: else the budget leaks |
 //! | `regret`, `regret_se` | V*(eta) - greedy CVaR_alpha (lava-point: the oracle's certified CVaR in place of V*), and its standard error |
 //! | `antagonist_gap`, `antagonist_gap_se` | greedy game value - greedy CVaR_alpha, and its standard error |
+//! | `class_regret` | CVaR_alpha of the best stationary policy found - greedy CVaR_alpha, where the protagonist does not see the time; exact |
+//! | `response_gain`, `response_error` | mean return of the best response to the antagonist - V*(eta), and an estimate of its numerical error |
+//! | `exploitability` | the larger one of `regret` and `response_gain` |
 //! | `budget_use` | max over audited trajectories of prod delta / eta, at most 1 |
 //! | `budget_violations` | steps or trajectories beyond tolerance, 0 |
 
 use super::settings::{self, Settings, Task};
 use super::{Optimum, ReportError, Worlds, statistics};
+use crate::exact::yardstick::Exploitability;
 use crate::experiment::archive::{FIRST_METHOD, RunFiles, RunName, Store};
 use crate::experiment::artefacts::{
     Audit, Certificate, Chance, Evaluation, Manifest, Play, SCHEMA,
@@ -178,6 +183,14 @@ impl<'a> Facts<'a> {
         }
     }
 
+    fn class_regret(&self) -> Option<f64> {
+        self.certificate?.class_regret
+    }
+
+    fn exploitability(&self) -> Option<Exploitability> {
+        self.certificate?.exploitability
+    }
+
     /// CVaR at the run's own level.
     fn own_cvar(&self, law: Option<&ReturnLaw>) -> Option<f64> {
         cvar(law, self.run.alpha())
@@ -225,6 +238,17 @@ const METHOD_COLUMNS: [Column; 2] = [
 /// The column that tells runs of one method apart by their settings, where there are such.
 const SETTINGS_COLUMN: Column =
     ("settings", |of| Field::Text(of.run.label.clone().unwrap_or_default()));
+
+/// The columns of certificates that runs of former versions do not have; left out where no run has one.
+const LATER_COLUMNS: [Column; 4] = [
+    ("class_regret", |of| Field::Number(of.class_regret())),
+    ("response_gain", |of| Field::Number(of.exploitability().map(|of| of.response_gain))),
+    ("response_error", |of| Field::Number(of.exploitability().map(|of| of.response_error))),
+    ("exploitability", |of| Field::Number(of.exploitability().map(|of| of.epsilon))),
+];
+
+/// The column that they stand before.
+const AFTER_LATER_COLUMNS: &str = "budget_use";
 
 /// The other columns, in order.
 const COLUMNS: [Column; 31] = [
@@ -343,6 +367,15 @@ impl Runs {
     /// The text of `runs.csv`.
     pub fn to_csv(&self) -> String {
         let mut columns = COLUMNS.to_vec();
+        let has_later = |run: &Run| {
+            let facts = Facts::of(run);
+            facts.class_regret().is_some() || facts.exploitability().is_some()
+        };
+        if self.runs.iter().any(has_later) {
+            let place = columns.iter().position(|(name, _)| *name == AFTER_LATER_COLUMNS);
+            let place = place.expect("the columns have it");
+            columns.splice(place..place, LATER_COLUMNS);
+        }
         if !self.are_plain() {
             columns.splice(1..1, METHOD_COLUMNS);
         }

@@ -186,8 +186,12 @@ fn violations(group: &Group) -> Option<u64> {
     audits.map(|audit| audit.violations).reduce(|a, b| a + b)
 }
 
+/// Columns that results of former versions have no numbers for. CSV files leave them out where no row has
+/// one, so that those of such results stay as they are.
+const LATER: [&str; 3] = ["class_regret", "exploitability", "response_gain"];
+
 /// The columns, in order. World, eta, alpha, seeds and failures stand before them in every format.
-pub static COLUMNS: [Column; 31] = [
+pub static COLUMNS: [Column; 34] = [
     Column {
         key: "mean",
         title: "mean",
@@ -381,6 +385,17 @@ pub static COLUMNS: [Column; 31] = [
         compute: |group, _| estimate(group.mean(|measures| measures.regret)),
     },
     Column {
+        key: "class_regret",
+        title: "class regret",
+        blocks: &[Block::Game],
+        format: Format::Estimate(4),
+        best: Best::None,
+        meaning: "CVaR_1/eta of the best policy that a local search finds among those that do not see the time, \
+                  minus that of the greedy protagonist, which is one of them",
+        brief: "the regret among policies that do not see the time",
+        compute: |group, _| estimate(group.mean(|measures| measures.class_regret)),
+    },
+    Column {
         key: "antagonist_gap",
         title: "antagonist gap",
         blocks: &[Block::Game],
@@ -390,6 +405,27 @@ pub static COLUMNS: [Column; 31] = [
                   how far the antagonist is from the worst case (0: perfect)",
         brief: "0 for a perfect antagonist",
         compute: |group, _| estimate(group.mean(|measures| measures.antagonist_gap)),
+    },
+    Column {
+        key: "exploitability",
+        title: "exploitability",
+        blocks: &[Block::Game],
+        format: Format::Estimate(4),
+        best: Best::None,
+        meaning: "the larger one of the regret and of what the best response to the antagonist gains over the best \
+                  possible CVaR_1/eta; that response may see the budget, so it is an upper bound",
+        brief: "the most that a better player of either side would gain",
+        compute: |group, _| estimate(group.mean(|measures| measures.exploitability)),
+    },
+    Column {
+        key: "response_gain",
+        title: "response gain",
+        blocks: &[],
+        format: Format::Estimate(4),
+        best: Best::None,
+        meaning: "mean return of the best response to the antagonist minus the best possible CVaR_1/eta",
+        brief: "",
+        compute: |group, _| estimate(group.mean(|measures| measures.response_gain)),
     },
     Column {
         key: "timeout",
@@ -627,6 +663,12 @@ pub struct Table {
 }
 
 impl Table {
+    /// Whether CSV files have the column.
+    pub fn lists(&self, column: usize) -> bool {
+        let later = LATER.contains(&COLUMNS[column].key);
+        !later || self.worlds.iter().any(|world| world.has(column))
+    }
+
     /// Computes every cell. The first results are what the others are compared with.
     pub fn new(results: &[Results]) -> Table {
         let groups = || results.iter().flat_map(|results| &results.groups);
