@@ -307,8 +307,8 @@ fn the_antagonist_of_a_network_answers_with_the_ratios_it_plays_with() {
         let mut frozen = FrozenOpponent::new(&constants, opponent.as_mut()).unwrap();
         let mut asked = Vec::new();
         let right = lava_envs::action::Discrete::index(Move::Right);
-        for slot in 0..30 {
-            let budget = [budgets[slot].get()];
+        for (slot, budget) in budgets.iter().enumerate() {
+            let budget = [budget.get()];
             assert!(frozen.ratios(slot as u32, 40 + slot, right, &budget, &mut asked));
         }
         assert_eq!(asked, all);
