@@ -16,7 +16,16 @@
 //! D_t = gamma D_{t+1} + e_t (A_t - gamma D_{t+1}),    e_t = d log delta_t(o_t) / d log eta_t,
 //! ```
 //!
-//! which is unbiased where A is. For the exact worst case D = VaR - CVaR of the remaining return, which
+//! which is unbiased where A is. In the game `joint` a step has two halves: A_t before the protagonist's draw,
+//! with delta_A and eta_t, and O_t before the outcome, with delta_O and eta_t / delta_A(a_t). Each half pays
+//! from the budget of the one that follows,
+//!
+//! ```text
+//! D_{O,t} = gamma D_{A,t+1} + e_O (A_O - gamma D_{A,t+1}),    charge of O_t: gamma D_{A,t+1},
+//! D_{A,t} = D_{O,t} + e_A (A_A - D_{O,t}),                    charge of A_t: D_{O,t}.
+//! ```
+//!
+//! For the exact worst case D = VaR - CVaR of the remaining return, which
 //! is never negative.
 
 /// Step of the forward differences by log eta_t. Backward ones would need a budget below 1.
@@ -46,6 +55,29 @@ impl BudgetSensitivity {
                 advantages[at] -= worth;
                 *later = worth + self.elasticities[at] * advantages[at];
             }
+        }
+    }
+}
+
+/// Charges the advantages of both halves of the steps of the game `joint`. The elasticities and the
+/// advantages are those of the draw and of the outcome; the game goes on from a draw, after the last step
+/// as well, so that what the last outcome leaves is worth `of_draws.last`.
+pub fn charge_both(
+    (of_draws, by_draws): (&BudgetSensitivity, &mut [f32]),
+    (of_outcomes, by_outcomes): (&BudgetSensitivity, &mut [f32]),
+    ended: &[bool],
+    gamma: f64,
+) {
+    let slots = of_draws.last.len();
+    let mut later = of_draws.last.clone();
+    for row in (0..ended.len() / slots).rev() {
+        for (slot, later) in later.iter_mut().enumerate() {
+            let at = row * slots + slot;
+            let worth = if ended[at] { 0.0 } else { gamma as f32 * *later };
+            by_outcomes[at] -= worth;
+            let worth = worth + of_outcomes.elasticities[at] * by_outcomes[at];
+            by_draws[at] -= worth;
+            *later = worth + of_draws.elasticities[at] * by_draws[at];
         }
     }
 }
