@@ -7,16 +7,17 @@ use cvar_game::game::budget::Eta;
 use cvar_game::learn::device::Device;
 use cvar_game::learn::method::{Arena, Players, Setting, Training};
 use cvar_game::learn::methods::game::GameTraining;
-use cvar_game::learn::options::{Acts, TrainOptions};
+use cvar_game::learn::options::{Acts, PlaneLaw, TrainOptions};
 use cvar_game::learn::pair::Pair;
 use cvar_game::learn::play::{Play, Played, play};
 use cvar_game::learn::policy::{Draw, Mode};
 use lava_envs::action::{Discrete, Finite, uniform_index};
 use lava_envs::{
-    Action, ConfigError, End, Field, FiniteLaw, FiniteModel, NoSuchState, Scene, Step, World,
-    conformance,
+    Action, ConfigError, End, Field, FiniteLaw, FiniteModel, GridConfig, LavaGrid, LavaPoint,
+    NoSuchState, PointConfig, Scene, Step, World, conformance,
 };
-use rand::Rng;
+use rand::rngs::ChaCha8Rng;
+use rand::{Rng, RngExt, SeedableRng};
 use serde::{Deserialize, Serialize};
 use std::sync::LazyLock;
 
@@ -159,7 +160,7 @@ impl World for Fork {
     }
     fn restore(&mut self, slot: usize, snapshot: Place) -> Result<(), NoSuchState> {
         if snapshot.state > OVER {
-            return Err(NoSuchState);
+            return Err(NoSuchState(snapshot.state.to_string()));
         }
         self.slots[slot] = snapshot;
         Ok(())
@@ -272,6 +273,116 @@ fn against<W: Arena>(
     let (mut protagonist, mut opponent) =
         (Players::protagonist(pair), Players::opponent(pair).unwrap());
     play(world, protagonist.as_mut(), opponent.as_mut(), &setting, &mut ())
+}
+
+/// Large random weights for both halves of the antagonist.
+fn shaken<W: Arena>(world: &W, options: &TrainOptions, eta: f64, strength: f32) -> Pair<W> {
+    let mut pair = Pair::new(world, &setting(options, eta, 3));
+    let mut random = ChaCha8Rng::seed_from_u64(1);
+    let networks = [
+        pair.antagonist.as_mut().unwrap().network_mut(),
+        pair.action_antagonist.as_mut().unwrap().network_mut(),
+    ];
+    for network in networks {
+        network.change(|weights| {
+            for weight in weights {
+                *weight = strength * (*weight + random.random_range(-0.1f32..0.1));
+            }
+        });
+    }
+    pair
+}
+
+/// On every trajectory prod delta <= eta, E[delta] = 1 in every half step, and nominal episodes weighted by
+/// prod delta have the mean of the antagonist's own episodes.
+fn check_budget<W: Arena>(world: impl Fn() -> W, change: impl Fn(&mut TrainOptions)) {
+    let mut options = options(Acts::Joint);
+    change(&mut options);
+    for (eta, strength) in [(1.5, 1.0), (3.0, 6.0), (25.0, 1.0), (100.0, 40.0)] {
+        let pair = shaken(&world(), &options, eta, strength);
+        let of = |draw| {
+            let played = against(world(), &pair, (Mode::Sampled, draw), (eta, 2_000));
+            assert!(played.normalisation_error <= 1e-6, "{}", played.normalisation_error);
+            for episode in &played.episodes {
+                let used = episode.likelihood_ratio / eta;
+                assert!(used <= 1.0 + 1e-6, "prod delta / eta = {used} at strength {strength}");
+            }
+            let weight = |ratio: f64| if draw == Draw::Nominal { ratio } else { 1.0 };
+            let values: Vec<f64> = (played.episodes.iter())
+                .map(|episode| weight(episode.likelihood_ratio) * episode.atom.value)
+                .collect();
+            let count = values.len() as f64;
+            let mean = values.iter().sum::<f64>() / count;
+            (mean, values.iter().map(|value| (value - mean).powi(2)).sum::<f64>() / count / count)
+        };
+        let [(weighted, weighted_variance), (direct, direct_variance)] =
+            [Draw::Nominal, Draw::Perturbed].map(of);
+        let error = (weighted_variance + direct_variance).sqrt();
+        // Of few nominal episodes that weigh as much as eta the variance is not known.
+        if eta < 10.0 {
+            let off = (weighted - direct).abs();
+            assert!(off < 4.0 * error, "{weighted} against {direct}, error {error}");
+        }
+        // A greedy protagonist draws nothing.
+        let greedy = against(world(), &pair, (Mode::Greedy, Draw::Perturbed), (eta, 200));
+        assert!(greedy.episodes.iter().all(|e| e.likelihood_ratio <= eta * (1.0 + 1e-6)));
+    }
+}
+
+#[test]
+fn no_antagonist_breaks_the_budget_with_its_two_halves() {
+    check_budget(|| LavaGrid::new(&GridConfig::default(), 250).unwrap(), |_| {});
+    for policy in [PlaneLaw::Gaussian, PlaneLaw::Disc] {
+        let world = || LavaPoint::new(&PointConfig::default(), 250).unwrap();
+        check_budget(world, |options| options.policy = policy);
+    }
+}
+
+/// Under nominal chance the draws are those of the policy itself, bit for bit.
+#[test]
+fn an_antagonist_that_only_reports_changes_no_episode() {
+    let world = || LavaGrid::new(&GridConfig::default(), 50).unwrap();
+    let of = |acts| {
+        let pair = Pair::new(&world(), &setting(&options(acts), 25.0, 3));
+        let played = against(world(), &pair, (Mode::Sampled, Draw::Nominal), (25.0, 200));
+        played.episodes.iter().map(|e| (e.atom.value, e.atom.steps)).collect::<Vec<_>>()
+    };
+    assert_eq!(of(Acts::Outcome), of(Acts::Joint));
+}
+
+/// Training with a break after every update ends with the same bits as without, and weights survive
+/// their file.
+#[test]
+fn breaks_change_nothing() {
+    let mut options = options(Acts::Joint);
+    options.steps = 8 * options.rollout();
+    (options.budget_wait, options.budget_rise, options.response) = (0.1, 0.3, 0.2);
+    let setting = setting(&options, 4.0, 1);
+    let mut whole = GameTraining::new(fork(0.9, options.parallel_episodes), &setting);
+    let mut state = Training::state(&whole);
+    loop {
+        let mut broken = GameTraining::new(fork(0.9, options.parallel_episodes), &setting);
+        Training::restore(&mut broken, &state).unwrap();
+        let (expected, found) = (whole.update().unwrap(), broken.update().unwrap());
+        assert_eq!(format!("{expected:?}"), format!("{found:?}"));
+        state = Training::state(&broken);
+        assert!(state == Training::state(&whole));
+        if found.is_none() {
+            break;
+        }
+    }
+    let bytes = whole.pair.weights(String::new()).unwrap();
+    let mut other = Pair::new(&fork(0.9, 1), &Setting { seed: 9, ..setting.clone() });
+    other.load(&bytes).unwrap();
+    let parameters = |pair: &Pair<Fork>| -> Vec<f32> {
+        pair.action_antagonist.as_ref().unwrap().network().parameters().to_vec()
+    };
+    assert_eq!(parameters(&whole.pair), parameters(&other));
+    // A pair of the game `outcome` has no such half, and its file no such tensors.
+    let outcome = TrainOptions { antagonist_acts: Acts::Outcome, ..options.clone() };
+    let alone = Pair::new(&fork(0.9, 1), &Setting { options: &outcome, ..setting.clone() });
+    let error = other.load(&alone.weights(String::new()).unwrap()).unwrap_err().to_string();
+    assert!(error.contains("action-antagonist.actor.hidden.weight"), "{error}");
 }
 
 #[test]
