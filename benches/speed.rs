@@ -27,7 +27,7 @@ use cvar_game::learn::methods::game::GameTraining;
 use cvar_game::learn::options::TrainOptions;
 use cvar_game::learn::pair::Pair;
 use cvar_game::learn::policy::Mode;
-use cvar_game::learn::ppo::Rates;
+use cvar_game::learn::ppo::{Rates, Signal};
 use cvar_game::learn::rollout::{Collector, Terms};
 use lava_envs::random::{ChaCha8Rng, Purpose, stream};
 use lava_envs::{GaussianLaw, LavaGrid, LavaPoint, Law, Move, World};
@@ -150,7 +150,7 @@ fn update<W: Arena>(criterion: &mut Criterion) {
     let its = &options.protagonist;
     group.bench_function(BenchmarkId::new(W::NAME, "protagonist"), |bencher| {
         bencher.iter(|| {
-            player.update(&collector.protagonist, None, 1.0, its, rates(its.entropy), random)
+            player.update(&collector.protagonist, Signal::Own, 1.0, its, rates(its.entropy), random)
         });
     });
     let player = pair.antagonist.as_mut().expect("eta is above 1");
@@ -162,7 +162,8 @@ fn update<W: Arena>(criterion: &mut Criterion) {
             let played = &collector.antagonist;
             let sensitivity =
                 options.budget_sensitivity.then(|| player.budget_sensitivity(played, &more));
-            player.update(played, sensitivity.as_ref(), 1.0, its, rates(its.entropy), random)
+            let signal = sensitivity.as_ref().map_or(Signal::Own, Signal::Charged);
+            player.update(played, signal, 1.0, its, rates(its.entropy), random)
         });
     });
     group.finish();

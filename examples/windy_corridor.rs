@@ -99,7 +99,7 @@ impl Walk {
 }
 
 impl Action for Walk {
-    type Kind = Finite;
+    type Kind = Finite<3>;
 
     fn uniform(random: &mut impl Rng) -> Walk {
         uniform_index(random)

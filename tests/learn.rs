@@ -13,7 +13,7 @@ use cvar_game::learn::methods::game::{GameTraining, schedule};
 use cvar_game::learn::network::{Network, Outputs, Shape};
 use cvar_game::learn::observation::Observation;
 use cvar_game::learn::options::{
-    Adversary, Credit, FamilyOptions, PlaneLaw, PlayerOptions, Role, TrainOptions, View,
+    Acts, Adversary, Credit, FamilyOptions, PlaneLaw, PlayerOptions, Role, TrainOptions, View,
 };
 use cvar_game::learn::pair::Pair;
 use cvar_game::learn::plane::DiscPolicy;
@@ -65,6 +65,7 @@ fn options() -> TrainOptions {
         response: 0.0,
         observation: View::Coordinates,
         adversary: Adversary::Learned,
+        antagonist_acts: Acts::Outcome,
         hide_budget: false,
         budget_sensitivity: true,
         protagonist: player(),
@@ -196,7 +197,7 @@ fn samples<H: Head>(
 
 #[test]
 fn the_loss_gradient_equals_finite_differences_for_every_head() {
-    let categorical = CategoricalPolicy::<Move>::default();
+    let categorical = CategoricalPolicy::<Move, 4>::default();
     let drawn = samples(&categorical, 12, &[], |r| ((), Move::ALL[r.random_range(0..4usize)]));
     check_loss_gradient(&categorical, &drawn, &[], 1);
 

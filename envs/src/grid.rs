@@ -142,7 +142,7 @@ impl Move {
 }
 
 impl Action for Move {
-    type Kind = Finite;
+    type Kind = Finite<MOVES>;
 
     fn uniform(random: &mut impl Rng) -> Move {
         uniform_index(random)

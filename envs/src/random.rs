@@ -22,6 +22,8 @@ pub enum Purpose {
     EvaluationOutcomes,
     /// Resampling of statistics.
     Bootstrap,
+    /// Initial weights of the antagonist of the protagonist's draw.
+    ActionAntagonistWeights,
 }
 
 /// The stream of `seed` for a purpose; `index` distinguishes the streams of one purpose (for example

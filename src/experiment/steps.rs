@@ -111,8 +111,8 @@ impl<W: World> Watcher<W> for Rows<'_> {
         row.extend(W::action_columns(game.actions[slot]));
         row.extend(W::outcome_columns(game.outcomes[slot]));
         row.extend([
-            ("delta", Field::Number(game.ratios[slot])),
-            ("budget", Field::Number(game.budgets_before[slot].get())),
+            ("delta", Field::Number(game.likelihood_ratio(slot))),
+            ("budget", Field::Number(game.budgets_at_draw[slot].get())),
             ("reward", Field::Number(step.reward)),
             // A map without lava has no distance to it.
             (

@@ -91,6 +91,11 @@ impl<const N: usize> Perturbation for FinitePerturbation<N> {
         self.ratio[self.top]
     }
 
+    fn infimum(&self) -> f64 {
+        let possible = (0..N).filter(|&i| self.nominal[i] > 0.0);
+        possible.map(|i| self.ratio[i]).fold(f64::INFINITY, f64::min)
+    }
+
     fn sample<R: Rng>(&self, random: &mut R) -> usize {
         sample_index(&self.perturbed, random)
     }

@@ -144,6 +144,11 @@ impl Perturbation for GaussianPerturbation {
         self.mixing.likelihood_ratio(self.supremum)
     }
 
+    /// lambda: far from the bumps delta^0 tends to 0.
+    fn infimum(&self) -> f64 {
+        1.0 - self.mixing.weight
+    }
+
     /// A draw from the mixture of N(0, I) and the N(m_j, S_j).
     fn sample<R: Rng>(&self, random: &mut R) -> Vector2<f64> {
         let mut level = random.random::<f64>();

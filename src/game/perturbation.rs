@@ -41,6 +41,9 @@ pub trait Perturbation {
     /// sup_o delta_t(o), at most the budget.
     fn supremum(&self) -> f64;
 
+    /// inf_o delta_t(o) over the outcomes that can happen, or a lower bound of it.
+    fn infimum(&self) -> f64;
+
     /// Draws an outcome from the perturbed law P_t delta_t.
     fn sample<R: Rng>(&self, random: &mut R) -> <Self::Law as Law>::Outcome;
 

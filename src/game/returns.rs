@@ -55,6 +55,11 @@ impl ReturnSoFar {
         self.steps += 1;
     }
 
+    /// What the rest of the episode must return, discounted from now on, for the whole return to be `value`.
+    pub fn missing(&self, value: f64) -> f64 {
+        (value - self.value) / self.discount
+    }
+
     /// The episode as an atom of the law of the return, of mass 1, once it has ended so.
     pub fn ended(self, end: End) -> Atom {
         let ReturnSoFar { value, undiscounted, steps, .. } = self;

@@ -7,12 +7,13 @@
 
 use super::budget_sensitivity::{BudgetSensitivity, LARGEST, STEP};
 use super::device::Device;
+use super::gae::Estimates;
 use super::head::{AntagonistHead, Head};
 use super::inputs::{Columns, Inputs};
 use super::network::Network;
 use super::options::{FamilyOptions, PlayerOptions};
 use super::policy::{Draw, Streams};
-use super::ppo::{Losses, Player, Rates};
+use super::ppo::{Losses, Player, Rates, Signal};
 use super::state::{PlayerState, Unfit};
 use super::trajectories::Trajectories;
 use crate::game::budget::Budget;
@@ -48,6 +49,13 @@ pub struct FamilyEntry<L: Law> {
     /// `train.family.kind`.
     pub kind: &'static str,
     antagonist: fn(&FamilyOptions, Sizes<'_>) -> Box<dyn Antagonist<L>>,
+}
+
+/// The options for a law that is not the world's law of chance: they stay, and its default family takes
+/// the place of one that does not fit it.
+pub fn fitting<L: Perturbed>(options: &FamilyOptions) -> FamilyOptions {
+    let kind = if family::<L>(options).is_ok() { options.kind.clone() } else { "auto".to_owned() };
+    FamilyOptions { kind, ..options.clone() }
 }
 
 /// How large an antagonist's networks are, and where they are.
@@ -143,12 +151,23 @@ pub struct Reweighting<'a, L: Law> {
     pub draw: Draw,
     /// Random streams.
     pub streams: &'a mut [Streams],
+    /// Which of a slot's streams the outcomes are drawn from.
+    pub stream: fn(&mut Streams) -> &mut ChaCha8Rng,
     /// Receives the outcomes.
     pub outcomes: &'a mut Vec<L::Outcome>,
     /// Receives their likelihood ratios.
     pub ratios: &'a mut [f64],
     /// Receives max |`E_P[delta_t]` - 1|, if it is requested.
     pub normalisation_error: Option<&'a mut f64>,
+}
+
+/// The likelihood ratio of what happened.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Ratio {
+    /// delta(o).
+    pub realised: f64,
+    /// The infimum of delta over all that could have happened, or a lower bound of it.
+    pub least: f64,
 }
 
 /// An antagonist of any family.
@@ -174,11 +193,17 @@ pub trait Antagonist<L: Law>: Debug + Send {
         with_more_budget: &dyn Fn(&mut Inputs, f64),
     ) -> BudgetSensitivity;
 
+    /// See [`Player::estimates`].
+    fn estimates(&self, played: &Played<L>, gamma: f64, options: &PlayerOptions) -> Estimates;
+
+    /// The likelihood ratios along the recorded trajectories, if the networks are those that recorded them.
+    fn ratios(&self, played: &Played<L>) -> Vec<Ratio>;
+
     /// A PPO update, see [`Player::update`].
     fn update(
         &mut self,
         played: &Played<L>,
-        sensitivity: Option<&BudgetSensitivity>,
+        signal: Signal<'_>,
         gamma: f64,
         options: &PlayerOptions,
         rates: Rates,
@@ -211,7 +236,7 @@ impl<F: Family + Send + 'static> Antagonist<F::Law> for Player<AntagonistHead<F>
         let mut parameters = Vec::new();
         let mut error: f64 = 0.0;
         for (slot, (law, &budget)) in of.laws.iter().zip(of.budgets).enumerate() {
-            let random = &mut of.streams[slot].outcomes;
+            let random = (of.stream)(&mut of.streams[slot]);
             match of.outputs {
                 Some(outputs) => self.parameters_in(outputs, slot, &mut parameters),
                 None => {
@@ -278,16 +303,37 @@ impl<F: Family + Send + 'static> Antagonist<F::Law> for Player<AntagonistHead<F>
         }
     }
 
+    fn estimates(&self, played: &Played<F::Law>, gamma: f64, options: &PlayerOptions) -> Estimates {
+        Player::estimates(self, played, gamma, options)
+    }
+
+    fn ratios(&self, played: &Played<F::Law>) -> Vec<Ratio> {
+        let (mut outputs, mut parameters) = (Vec::new(), Vec::new());
+        let [during, _] =
+            played.inputs.rows().split_at(played.rewards.len(), self.network.shape().width());
+        self.network.act(during, &mut outputs);
+        let choices = played.given.iter().zip(&played.choices).enumerate();
+        choices
+            .map(|(i, ((law, budget), &outcome))| {
+                self.parameters_in(&outputs, i, &mut parameters);
+                let perturbation = self.head.0.perturbation(&parameters, law, *budget);
+                let (realised, least) =
+                    (perturbation.likelihood_ratio(outcome), perturbation.infimum());
+                Ratio { realised, least }
+            })
+            .collect()
+    }
+
     fn update(
         &mut self,
         played: &Played<F::Law>,
-        sensitivity: Option<&BudgetSensitivity>,
+        signal: Signal<'_>,
         gamma: f64,
         options: &PlayerOptions,
         rates: Rates,
         random: &mut ChaCha8Rng,
     ) -> Losses {
-        Player::update(self, played, sensitivity, gamma, options, rates, random)
+        Player::update(self, played, signal, gamma, options, rates, random)
     }
 
     fn not_finite(&self) -> Option<&'static str> {

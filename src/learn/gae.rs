@@ -4,6 +4,15 @@
 //! episode. The end of an episode is a true end, the time limit included: V is 0 after it. Where
 //! the rollout ends within an episode, V(s_T) is bootstrapped from the critic.
 
+/// Values and advantages along the trajectories of a rollout.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Estimates {
+    /// V by the critic, shape `[steps + 1, slots]`.
+    pub values: Vec<f32>,
+    /// Advantages, shape `[steps, slots]`.
+    pub advantages: Vec<f32>,
+}
+
 /// Writes the advantages. Time-major arrays: `rewards` and `ended` have shape `[steps, slots]`,
 /// `values` has one more row, the values of the states after the last step.
 pub fn advantages(

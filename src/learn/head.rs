@@ -10,11 +10,10 @@ use super::policy::Mode;
 use crate::game::budget::Budget;
 use crate::game::perturbation::{Family, Perturbation};
 use lava_envs::Force;
-use lava_envs::action::{Action, Discrete, Finite};
-use lava_envs::law::{Law, sample_index};
+use lava_envs::action::{Action, ActionKind, Discrete, Finite};
+use lava_envs::law::{FiniteLaw, GaussianLaw, Law};
 use nalgebra::Vector2;
-use rand::{Rng, RngExt};
-use rand_distr::StandardNormal;
+use rand::Rng;
 use smallvec::SmallVec;
 use std::marker::PhantomData;
 
@@ -56,10 +55,25 @@ pub trait Head: Clone + std::fmt::Debug {
     ) -> (f64, f64);
 }
 
-/// A protagonist's head: a law of actions.
+/// A protagonist's head: a law of actions, which is a law of noise and a map from noise to actions.
 pub trait PolicyHead: Head<Given = ()> {
+    /// The law of the noise.
+    type Noise: Law;
+
+    /// The law of the noise with these parameters.
+    fn noise(&self, parameters: &[f64]) -> Self::Noise;
+
+    /// The action that the noise means.
+    fn realise(
+        &self,
+        parameters: &[f64],
+        noise: <Self::Noise as Law>::Outcome,
+    ) -> Self::Choice;
+
     /// Draws an action.
-    fn draw(&self, parameters: &[f64], random: &mut impl Rng) -> Self::Choice;
+    fn draw(&self, parameters: &[f64], random: &mut impl Rng) -> Self::Choice {
+        self.realise(parameters, self.noise(parameters).sample(random))
+    }
 
     /// The greedy action: the mode of the law.
     fn greedy(&self, parameters: &[f64]) -> Self::Choice;
@@ -78,9 +92,9 @@ pub trait PolicyHead: Head<Given = ()> {
 }
 
 /// A kind of action that has a head; `A` is the action.
-pub trait HeadOf<A: Action> {
+pub trait HeadOf<A: Action>: ActionKind {
     /// The head.
-    type Head: PolicyHead<Choice = A>;
+    type Head: PolicyHead<Choice = A, Noise = Self::Noise>;
 
     /// Checks the options of the head.
     ///
@@ -101,10 +115,10 @@ pub trait HeadOf<A: Action> {
     fn from_index(index: usize) -> Option<A>;
 }
 
-impl<A: Discrete> HeadOf<A> for Finite {
-    type Head = CategoricalPolicy<A>;
+impl<const N: usize, A: Discrete> HeadOf<A> for Finite<N> {
+    type Head = CategoricalPolicy<A, N>;
 
-    fn head(_: &TrainOptions) -> CategoricalPolicy<A> {
+    fn head(_: &TrainOptions) -> CategoricalPolicy<A, N> {
         CategoricalPolicy::default()
     }
 
@@ -117,11 +131,11 @@ impl<A: Discrete> HeadOf<A> for Finite {
     }
 }
 
-/// Softmax over finitely many actions.
+/// Softmax over `N` actions.
 #[derive(Debug, Clone, Copy)]
-pub struct CategoricalPolicy<A>(PhantomData<A>);
+pub struct CategoricalPolicy<A, const N: usize>(PhantomData<A>);
 
-impl<A> Default for CategoricalPolicy<A> {
+impl<A, const N: usize> Default for CategoricalPolicy<A, N> {
     fn default() -> Self {
         CategoricalPolicy(PhantomData)
     }
@@ -130,7 +144,7 @@ impl<A> Default for CategoricalPolicy<A> {
 /// Probabilities of the actions, on the stack where they are few.
 pub type Probabilities = SmallVec<[f64; 8]>;
 
-impl<A: Discrete> CategoricalPolicy<A> {
+impl<A: Discrete, const N: usize> CategoricalPolicy<A, N> {
     /// Probabilities of the actions, from logits.
     pub fn softmax(logits: &[f64]) -> Probabilities {
         let highest = Self::highest(logits);
@@ -146,7 +160,7 @@ impl<A: Discrete> CategoricalPolicy<A> {
     }
 }
 
-impl<A: Discrete> Head for CategoricalPolicy<A> {
+impl<A: Discrete, const N: usize> Head for CategoricalPolicy<A, N> {
     type Given = ();
     type Choice = A;
 
@@ -192,9 +206,17 @@ impl<A: Discrete> Head for CategoricalPolicy<A> {
     }
 }
 
-impl<A: Discrete> PolicyHead for CategoricalPolicy<A> {
-    fn draw(&self, logits: &[f64], random: &mut impl Rng) -> A {
-        A::from_index(sample_index(&Self::softmax(logits), random))
+impl<A: Discrete, const N: usize> PolicyHead for CategoricalPolicy<A, N> {
+    type Noise = FiniteLaw<N>;
+
+    fn noise(&self, logits: &[f64]) -> Self::Noise {
+        const { assert!(A::COUNT == N, "an action's kind has another number of actions") };
+        let probabilities = Self::softmax(logits);
+        FiniteLaw { probabilities: std::array::from_fn(|i| probabilities[i]) }
+    }
+
+    fn realise(&self, _: &[f64], index: usize) -> A {
+        A::from_index(index)
     }
 
     fn greedy(&self, logits: &[f64]) -> A {
@@ -266,10 +288,14 @@ impl Head for GaussianPolicy {
 }
 
 impl PolicyHead for GaussianPolicy {
-    fn draw(&self, parameters: &[f64], random: &mut impl Rng) -> Force {
-        let [x, y] = std::array::from_fn(|i| {
-            parameters[i] + parameters[2 + i].exp() * random.sample::<f64, _>(StandardNormal)
-        });
+    type Noise = GaussianLaw;
+
+    fn noise(&self, _: &[f64]) -> GaussianLaw {
+        GaussianLaw
+    }
+
+    fn realise(&self, parameters: &[f64], z: Vector2<f64>) -> Force {
+        let [x, y] = std::array::from_fn(|i| parameters[i] + parameters[2 + i].exp() * z[i]);
         Force(Vector2::new(x, y))
     }
 

@@ -12,17 +12,24 @@ use super::policy::{Opponent, Policy};
 use super::state::Unfit;
 use super::weights::WeightsError;
 use crate::game::budget::Eta;
-use lava_envs::{Action, World};
+use lava_envs::action::{Action, ActionKind};
+use lava_envs::World;
 
 /// A world that can be trained in: its actions have a policy, its law of chance has a family of
 /// perturbations. Every world is one whose action and law are of a known kind.
 pub trait Arena:
-    World<Action: Action<Kind: HeadOf<<Self as World>::Action>>, Law: Perturbed>
+    World<
+        Action: Action<Kind: HeadOf<<Self as World>::Action> + ActionKind<Noise: Perturbed>>,
+        Law: Perturbed,
+    >
 {
 }
 
 impl<W> Arena for W where
-    W: World<Action: Action<Kind: HeadOf<<W as World>::Action>>, Law: Perturbed>
+    W: World<
+        Action: Action<Kind: HeadOf<<W as World>::Action> + ActionKind<Noise: Perturbed>>,
+        Law: Perturbed,
+    >
 {
 }
 

@@ -10,6 +10,7 @@
 //! | what a network's outputs mean | [`head`] |
 //! | the antagonist, and the families that it may use | [`family`] |
 //! | how its gradient counts the budget that it spends | [`budget_sensitivity`] |
+//! | what the protagonist's gradient owes to the budget | [`price`] |
 //! | what the players see | [`observation`] |
 //! | networks, their engines and their files | [`network`], [`device`], [`weights`] |
 //! | what training continues from | [`state`] |
@@ -31,6 +32,7 @@ pub mod plane;
 pub mod play;
 pub mod policy;
 pub mod ppo;
+pub mod price;
 pub mod rollout;
 pub mod state;
 pub mod trajectories;

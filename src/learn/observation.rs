@@ -3,7 +3,8 @@
 //! The protagonist sees the world's observation, and the time if it is time-aware, but not the budget:
 //! given the budget it would solve Chow's decomposition, which is not CVaR-optimal. The antagonist
 //! sees the situation after the action was chosen, its remaining budget as log eta_t / log eta, and
-//! the time if it is time-aware. Every row ends with the constant 1 of the networks' biases.
+//! the time if it is time-aware. In the game `joint` its half before the draw sees what the protagonist sees,
+//! its budget and the time likewise. Every row ends with the constant 1 of the networks' biases.
 //!
 //! As coordinates ([`View::Coordinates`], the paper's) these are a few numbers, in which a small network
 //! cannot turn sharply from one place to the next. As features ([`View::Features`]) they are
@@ -22,7 +23,7 @@ use super::head::HeadOf;
 use super::inputs::{Columns, Inputs};
 use super::method::Arena;
 use super::options::{TrainOptions, View};
-use super::policy::Situation;
+use super::policy::{DrawSituation, Situation};
 use crate::game::budget::Eta;
 use lava_envs::{Action, World};
 use std::f32::consts::FRAC_PI_2;
@@ -87,9 +88,35 @@ impl Observation {
         Columns { cells, numbers: numbers + self.time_columns(self.antagonist_time) }
     }
 
+    /// Sizes of what the antagonist of the protagonist's draw sees.
+    pub fn draw_columns<W: World>(&self) -> Columns {
+        let numbers = self.place_columns::<W>(W::OBSERVATION) + 1;
+        Columns { cells: self.states, numbers: numbers + self.time_columns(self.antagonist_time) }
+    }
+
     /// Writes what the protagonist sees in every slot.
     pub fn protagonist<W: World>(&self, world: &W, inputs: &mut Inputs) {
+        let place = self.place_columns::<W>(W::OBSERVATION);
         let width = self.protagonist_columns::<W>().numbers + 1;
+        self.show_states(world, width, inputs);
+        for (slot, row) in inputs.numbers.chunks_exact_mut(width).enumerate() {
+            close(world, slot, &mut row[place..]);
+        }
+    }
+
+    /// Writes what the antagonist of the protagonist's draw sees in every slot: the state, and its budget.
+    pub fn draw<W: World>(&self, of: &DrawSituation<'_, W>, inputs: &mut Inputs) {
+        let place = self.place_columns::<W>(W::OBSERVATION);
+        let width = self.draw_columns::<W>().numbers + 1;
+        self.show_states(of.world, width, inputs);
+        for (slot, row) in inputs.numbers.chunks_exact_mut(width).enumerate() {
+            row[place] = (of.budgets[slot].get().ln() * self.budget_scale) as f32;
+            close(of.world, slot, &mut row[place + 1..]);
+        }
+    }
+
+    /// Writes the state at the beginning of every row.
+    fn show_states<W: World>(&self, world: &W, width: usize, inputs: &mut Inputs) {
         let place = self.place_columns::<W>(W::OBSERVATION);
         inputs.cells.clear();
         inputs.numbers.resize(world.episodes() * width, 0.0);
@@ -101,7 +128,6 @@ impl Observation {
                 world.observe(slot, observation);
                 fourier(observation, waves);
             }
-            close(world, slot, &mut row[place..]);
         }
     }
 
@@ -131,6 +157,14 @@ impl Observation {
     pub fn with_more_budget<W: World>(&self, inputs: &mut Inputs, log_factor: f64) {
         let place = self.place_columns::<W>(W::SITUATION);
         for row in inputs.numbers.chunks_exact_mut(self.antagonist_columns::<W>().numbers + 1) {
+            row[place] += (log_factor * self.budget_scale) as f32;
+        }
+    }
+
+    /// The same for rows of the antagonist of the protagonist's draw.
+    pub fn with_more_budget_at_draw<W: World>(&self, inputs: &mut Inputs, log_factor: f64) {
+        let place = self.place_columns::<W>(W::OBSERVATION);
+        for row in inputs.numbers.chunks_exact_mut(self.draw_columns::<W>().numbers + 1) {
             row[place] += (log_factor * self.budget_scale) as f32;
         }
     }

@@ -40,6 +40,8 @@ pub struct TrainOptions {
     pub observation: View,
     /// Who reweights chance.
     pub adversary: Adversary,
+    /// What the antagonist reweights.
+    pub antagonist_acts: Acts,
     /// Hides the remaining budget from the antagonist (an ablation).
     pub hide_budget: bool,
     /// Whether the antagonist's gradient counts what it spends (see [`super::budget_sensitivity`]).
@@ -158,6 +160,16 @@ pub enum Adversary {
     /// One without memory that draws the parameters of each step's perturbation from N(0, 1)
     /// (an ablation).
     Random,
+}
+
+/// What the antagonist reweights in a step.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Acts {
+    /// The law of the outcome, after the action is drawn: the paper's game.
+    Outcome,
+    /// The protagonist's own draw as well.
+    Joint,
 }
 
 /// Options of one PPO player.

@@ -6,17 +6,23 @@ use super::head::{HeadOf, PolicyHead};
 use super::inputs::Inputs;
 use super::method::{Arena, Players, Setting};
 use super::observation::Observation;
-use super::options::{Adversary, Role};
-use super::policy::{Draw, Mode, Opponent, Policy, Response, Situation, Streams};
+use super::options::{Acts, Adversary, Role};
+use super::policy::{
+    Draw, DrawOpponent, DrawResponse, DrawSituation, Draws, Mode, Noise, Opponent, Policy, Response,
+    Situation, Streams,
+};
 use super::ppo::Player;
 use super::weights::{self, Weights, WeightsError};
 use lava_envs::random::{Purpose, stream};
-use lava_envs::{Action, World};
+use lava_envs::{Action, Law, World};
 
 /// The head of a world's protagonist.
 pub type HeadIn<W> = <<<W as World>::Action as Action>::Kind as HeadOf<<W as World>::Action>>::Head;
 /// The protagonist of a world.
 pub type Protagonist<W> = Player<HeadIn<W>>;
+
+/// Name of the antagonist's half on the protagonist's draw, in files and messages.
+pub const ACTION_ANTAGONIST: &str = "action-antagonist";
 
 /// The two players of a game.
 #[derive(Debug)]
@@ -25,6 +31,8 @@ pub struct Pair<W: Arena> {
     pub protagonist: Protagonist<W>,
     /// Reweights chance; absent at eta = 1, where it could not change anything.
     pub antagonist: Option<Box<dyn Antagonist<W::Law>>>,
+    /// Its half that reweights the protagonist's draw; absent but in the game `joint`.
+    pub action_antagonist: Option<Box<dyn Antagonist<Noise<W>>>>,
     /// What they see.
     pub observation: Observation,
     /// Whether the antagonist follows its network, or plays at random.
@@ -53,7 +61,18 @@ impl<W: Arena> Pair<W> {
                 &mut stream(seed, Purpose::AntagonistWeights, 0),
             )
         });
-        Pair { protagonist, antagonist, observation, adversary: options.adversary, device }
+        let joint = !eta.is_neutral() && options.antagonist_acts == Acts::Joint;
+        let action_antagonist = joint.then(|| {
+            family::antagonist(
+                &family::fitting::<Noise<W>>(&options.family),
+                observation.draw_columns::<W>(),
+                options.antagonist.hidden,
+                device,
+                &mut stream(seed, Purpose::ActionAntagonistWeights, 0),
+            )
+        });
+        let adversary = options.adversary;
+        Pair { protagonist, antagonist, action_antagonist, observation, adversary, device }
     }
 
     /// Parameters of a player's networks; empty for an absent one.
@@ -74,6 +93,7 @@ impl<W: Arena> Pair<W> {
             pair: self,
             inputs: Inputs::default(),
             outputs: Vec::new(),
+            draw_inputs: Inputs::default(),
             normalisation_error,
         })
     }
@@ -89,18 +109,23 @@ impl<W: Arena> Players<W> for Pair<W> {
     }
 
     fn weights(&self, about: String) -> Result<Vec<u8>, WeightsError> {
-        let mut networks = vec![(Role::Protagonist, &self.protagonist.network)];
-        networks.extend(self.antagonist.iter().map(|of| (Role::Antagonist, of.network())));
+        let mut networks = vec![(Role::Protagonist.name(), &self.protagonist.network)];
+        networks.extend(self.antagonist.iter().map(|of| (Role::Antagonist.name(), of.network())));
+        networks.extend(self.action_antagonist.iter().map(|of| (ACTION_ANTAGONIST, of.network())));
         weights::to_bytes(&networks, about)
     }
 
     fn load(&mut self, bytes: &[u8]) -> Result<(), WeightsError> {
         let file = Weights::read(bytes)?;
         let shape = self.protagonist.network.shape();
-        self.protagonist.network = file.network(Role::Protagonist, shape, self.device)?;
+        self.protagonist.network = file.network(Role::Protagonist.name(), shape, self.device)?;
         if let Some(antagonist) = &mut self.antagonist {
             let shape = antagonist.network().shape();
-            *antagonist.network_mut() = file.network(Role::Antagonist, shape, self.device)?;
+            *antagonist.network_mut() = file.network(Role::Antagonist.name(), shape, self.device)?;
+        }
+        if let Some(antagonist) = &mut self.action_antagonist {
+            let shape = antagonist.network().shape();
+            *antagonist.network_mut() = file.network(ACTION_ANTAGONIST, shape, self.device)?;
         }
         Ok(())
     }
@@ -138,7 +163,34 @@ impl<'a, H: PolicyHead> PpoPolicy<'a, H> {
     }
 }
 
-impl<W: World, H: PolicyHead<Choice = W::Action>> Policy<W> for PpoPolicy<'_, H> {
+impl<W, H> Draws<W> for PpoPolicy<'_, H>
+where
+    W: World,
+    H: PolicyHead<Choice = W::Action, Noise = Noise<W>>,
+{
+    fn laws(&mut self, world: &W, laws: &mut Vec<Noise<W>>) {
+        self.look(world);
+        let PpoPolicy { player, outputs, parameters, .. } = self;
+        laws.extend((0..world.episodes()).map(|slot| {
+            player.parameters_in(outputs, slot, parameters);
+            player.head.noise(parameters)
+        }));
+    }
+
+    fn realise(&mut self, noise: &[<Noise<W> as Law>::Outcome], actions: &mut Vec<W::Action>) {
+        let PpoPolicy { player, outputs, parameters, .. } = self;
+        actions.extend(noise.iter().enumerate().map(|(slot, &noise)| {
+            player.parameters_in(outputs, slot, parameters);
+            player.head.realise(parameters, noise)
+        }));
+    }
+}
+
+impl<W, H> Policy<W> for PpoPolicy<'_, H>
+where
+    W: World,
+    H: PolicyHead<Choice = W::Action, Noise = Noise<W>>,
+{
     fn choose(
         &mut self,
         world: &W,
@@ -169,6 +221,10 @@ impl<W: World, H: PolicyHead<Choice = W::Action>> Policy<W> for PpoPolicy<'_, H>
     fn sees_time(&self) -> bool {
         self.observation.protagonist_sees_time()
     }
+
+    fn draws(&mut self) -> Option<&mut dyn Draws<W>> {
+        Some(self)
+    }
 }
 
 /// A pair's antagonist at play.
@@ -179,6 +235,8 @@ pub struct LearnedOpponent<'a, W: Arena> {
     /// What it saw in its last step, a sample for each slot.
     pub inputs: Inputs,
     outputs: Vec<f32>,
+    /// What its half on the protagonist's draw saw in its last step.
+    pub draw_inputs: Inputs,
     normalisation_error: Option<f64>,
 }
 
@@ -211,6 +269,7 @@ impl<W: Arena> Opponent<W> for LearnedOpponent<'_, W> {
             budgets: situation.budgets,
             draw,
             streams,
+            stream: |of| &mut of.outcomes,
             outcomes: response.outcomes,
             ratios: response.ratios,
             normalisation_error: self.normalisation_error.as_mut(),
@@ -230,7 +289,37 @@ impl<W: Arena> Opponent<W> for LearnedOpponent<'_, W> {
         self.pair.observation.antagonist_sees_time()
     }
 
+    fn of_draws(&mut self) -> Option<&mut dyn DrawOpponent<W>> {
+        let plays = self.pair.action_antagonist.is_some();
+        plays.then_some(self)
+    }
+
     fn normalisation_error(&self) -> f64 {
         self.normalisation_error.unwrap_or(0.0)
+    }
+}
+
+impl<W: Arena> DrawOpponent<W> for LearnedOpponent<'_, W> {
+    fn respond_to_draw(
+        &mut self,
+        situation: &DrawSituation<'_, W>,
+        draw: Draw,
+        streams: &mut [Streams],
+        response: DrawResponse<'_, W>,
+    ) {
+        let antagonist = self.pair.action_antagonist.as_deref().expect("it plays");
+        self.pair.observation.draw(situation, &mut self.draw_inputs);
+        antagonist.network().act(self.draw_inputs.rows(), &mut self.outputs);
+        antagonist.reweight(Reweighting {
+            outputs: Some(&self.outputs),
+            laws: situation.laws,
+            budgets: situation.budgets,
+            draw,
+            streams,
+            stream: |of| &mut of.actions,
+            outcomes: response.noise,
+            ratios: response.ratios,
+            normalisation_error: self.normalisation_error.as_mut(),
+        });
     }
 }

@@ -15,7 +15,7 @@
 use super::head::{GaussianPolicy, Head, HeadOf, PolicyHead};
 use super::options::{PlaneLaw, TrainOptions};
 use super::truncated_normal::TruncatedNormal;
-use lava_envs::Force;
+use lava_envs::{Force, GaussianLaw};
 use lava_envs::action::Plane;
 use nalgebra::Vector2;
 use rand::{Rng, RngExt};
@@ -130,6 +130,18 @@ impl Head for DiscPolicy {
 }
 
 impl PolicyHead for DiscPolicy {
+    type Noise = GaussianLaw;
+
+    fn noise(&self, _: &[f64]) -> GaussianLaw {
+        GaussianLaw
+    }
+
+    fn realise(&self, parameters: &[f64], z: Vector2<f64>) -> Force {
+        let axes = Square::new(parameters).axes;
+        onto_disc([axes[0].at_normal(z.x), axes[1].at_normal(z.y)])
+    }
+
+    /// Straight from uniform numbers, which saves computing them from normal ones.
     fn draw(&self, parameters: &[f64], random: &mut impl Rng) -> Force {
         let axes = Square::new(parameters).axes;
         onto_disc(axes.map(|axis| axis.quantile(random.random())))
@@ -224,6 +236,16 @@ impl Head for PlanePolicy {
 }
 
 impl PolicyHead for PlanePolicy {
+    type Noise = GaussianLaw;
+
+    fn noise(&self, parameters: &[f64]) -> GaussianLaw {
+        selected!(self, head => head.noise(parameters))
+    }
+
+    fn realise(&self, parameters: &[f64], noise: Vector2<f64>) -> Force {
+        selected!(self, head => head.realise(parameters, noise))
+    }
+
     fn draw(&self, parameters: &[f64], random: &mut impl Rng) -> Force {
         selected!(self, head => head.draw(parameters, random))
     }

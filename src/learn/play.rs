@@ -144,7 +144,7 @@ pub fn play<W: World>(
             let step = game.steps[slot];
             episode.so_far.add(step.reward, play.gamma);
             episode.clearance = episode.clearance.min(game.world.clearance(slot));
-            episode.likelihood_ratio *= game.ratios[slot];
+            episode.likelihood_ratio *= game.likelihood_ratio(slot);
             watcher.after(&game, slot, episode.index, &episode.so_far);
             if let Some(end) = step.end {
                 if let Some(place) = played.get_mut(episode.index) {

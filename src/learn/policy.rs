@@ -3,8 +3,9 @@
 //! players of your own, implement these two traits.
 
 use crate::game::budget::Budget;
+use lava_envs::action::ActionKind;
 use lava_envs::random::ChaCha8Rng;
-use lava_envs::{Law, Outcome, World};
+use lava_envs::{Action, Law, Outcome, World};
 use serde::{Deserialize, Serialize};
 
 /// How a protagonist picks its action.
@@ -36,6 +37,9 @@ pub struct Streams {
     pub outcomes: ChaCha8Rng,
 }
 
+/// The law of the noise behind a policy's draws in a world.
+pub type Noise<W> = <<<W as World>::Action as Action>::Kind as ActionKind>::Noise;
+
 /// A protagonist.
 pub trait Policy<W: World> {
     /// Chooses an action in every slot of `world`; `streams` and `actions` have an entry per slot.
@@ -53,6 +57,20 @@ pub trait Policy<W: World> {
 
     /// Whether the policy depends on the time.
     fn sees_time(&self) -> bool;
+
+    /// The policy's draw, where an opponent can reweight it.
+    fn draws(&mut self) -> Option<&mut dyn Draws<W>> {
+        None
+    }
+}
+
+/// A policy's draw: noise of a known law, and a map from the noise to an action.
+pub trait Draws<W: World> {
+    /// Appends the law of the noise in every slot of `world`.
+    fn laws(&mut self, world: &W, laws: &mut Vec<Noise<W>>);
+
+    /// Appends the action that the noise means in every slot, where [`Draws::laws`] was asked last.
+    fn realise(&mut self, noise: &[<Noise<W> as Law>::Outcome], actions: &mut Vec<W::Action>);
 }
 
 /// What an opponent knows when it responds; slices have an entry per slot.
@@ -64,8 +82,29 @@ pub struct Situation<'a, W: World> {
     pub actions: &'a [W::Action],
     /// The nominal laws P_t.
     pub laws: &'a [W::Law],
+    /// The remaining budgets eta_t; where the action was drawn by the opponent as well, what is left of
+    /// them after that.
+    pub budgets: &'a [Budget],
+}
+
+/// What an opponent of the protagonist's draw knows before the action; slices have an entry per slot.
+#[derive(Debug)]
+pub struct DrawSituation<'a, W: World> {
+    /// The world, before the step.
+    pub world: &'a W,
+    /// The laws of the noise.
+    pub laws: &'a [Noise<W>],
     /// The remaining budgets eta_t.
     pub budgets: &'a [Budget],
+}
+
+/// What an opponent of the protagonist's draw decides; an entry per slot.
+#[derive(Debug)]
+pub struct DrawResponse<'a, W: World> {
+    /// The realised noise, appended slot by slot to an empty list.
+    pub noise: &'a mut Vec<<Noise<W> as Law>::Outcome>,
+    /// Its likelihood ratios delta_A.
+    pub ratios: &'a mut [f64],
 }
 
 /// What an opponent decides; an entry per slot.
@@ -100,10 +139,27 @@ pub trait Opponent<W: World> {
         true
     }
 
+    /// The opponent as one of the protagonist's draw, where it is one: the game `joint`.
+    fn of_draws(&mut self) -> Option<&mut dyn DrawOpponent<W>> {
+        None
+    }
+
     /// max |`E_P[delta_t]` - 1| over all perturbations so far, for the budget audit.
     fn normalisation_error(&self) -> f64 {
         0.0
     }
+}
+
+/// The half of an opponent that reweights the protagonist's draw, before the action.
+pub trait DrawOpponent<W: World> {
+    /// Draws the noise of every slot, from the streams of the actions, and reports its likelihood ratio.
+    fn respond_to_draw(
+        &mut self,
+        situation: &DrawSituation<'_, W>,
+        draw: Draw,
+        streams: &mut [Streams],
+        response: DrawResponse<'_, W>,
+    );
 }
 
 /// Chance as it is: every likelihood ratio is 1.

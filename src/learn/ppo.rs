@@ -13,7 +13,7 @@
 use crate::learn::adam::Adam;
 use crate::learn::budget_sensitivity::BudgetSensitivity;
 use crate::learn::device::Device;
-use crate::learn::gae;
+use crate::learn::gae::{self, Estimates};
 use crate::learn::head::Head;
 use crate::learn::inputs::{Columns, Inputs};
 use crate::learn::network::{Network, Outputs, Shape};
@@ -92,6 +92,16 @@ impl Losses {
         .find_map(|(name, value)| (!value.is_finite()).then_some(name))
     }
 
+    /// The means of two updates.
+    pub fn mean(of: [Losses; 2]) -> Losses {
+        let mut mean = Losses::default();
+        for losses in &of {
+            mean.add(losses, 0.5);
+            mean.explained_variance += 0.5 * losses.explained_variance;
+        }
+        mean
+    }
+
     fn add(&mut self, other: &Losses, weight: f64) {
         self.policy_loss += weight * other.policy_loss;
         self.value_loss += weight * other.value_loss;
@@ -109,6 +119,20 @@ pub struct Rates {
     pub learning_rate: f64,
     /// Weight of the entropy bonus.
     pub entropy: f64,
+}
+
+/// What an update reinforces the choices by.
+#[derive(Debug, Clone, Copy)]
+pub enum Signal<'a> {
+    /// The advantages by the player's own critic.
+    Own,
+    /// The same, charged for the budget that was spent.
+    Charged(&'a BudgetSensitivity),
+    /// These, of shape `[steps, slots]`.
+    Given(&'a [f32]),
+    /// These, where the mean of the score is not 0: to subtract a constant from them would change the
+    /// gradient. They are scaled by their root mean square and not centred.
+    Uncentred(&'a [f32]),
 }
 
 /// One sample as the loss sees it.
@@ -190,12 +214,27 @@ impl<H: Head> Player<H> {
         }
     }
 
-    /// One update on the trajectories of a rollout: epochs of minibatches in random order. The
-    /// advantages are charged for what was spent, where that is given.
+    /// Values and advantages along trajectories, by the critic.
+    pub fn estimates(
+        &self,
+        trajectories: &Trajectories<H::Given, H::Choice>,
+        gamma: f64,
+        options: &PlayerOptions,
+    ) -> Estimates {
+        let Trajectories { rewards, ended, slots, .. } = trajectories;
+        let (mut values, mut advantages) = (Vec::new(), Vec::new());
+        self.network.values(trajectories.inputs.rows(), &mut values);
+        let lambda = options.gae_lambda;
+        gae::advantages(rewards, ended, &values, *slots, gamma, lambda, &mut advantages);
+        Estimates { values, advantages }
+    }
+
+    /// One update on the trajectories of a rollout: epochs of minibatches in random order. The targets of
+    /// the critic are always its own.
     pub fn update(
         &mut self,
         trajectories: &Trajectories<H::Given, H::Choice>,
-        sensitivity: Option<&BudgetSensitivity>,
+        signal: Signal<'_>,
         gamma: f64,
         options: &PlayerOptions,
         rates: Rates,
@@ -221,12 +260,18 @@ impl<H: Head> Player<H> {
             advantage: advantages[i],
             target: advantages[i] + values[i],
         }));
-        if let Some(sensitivity) = sensitivity {
-            sensitivity.charge(advantages, &trajectories.ended, gamma);
-            for (sample, &advantage) in samples.iter_mut().zip(&*advantages) {
-                sample.advantage = advantage;
+        let reinforced = match signal {
+            Signal::Own => &advantages[..],
+            Signal::Charged(sensitivity) => {
+                sensitivity.charge(advantages, &trajectories.ended, gamma);
+                &advantages[..]
             }
+            Signal::Given(advantages) | Signal::Uncentred(advantages) => advantages,
+        };
+        for (sample, &advantage) in samples.iter_mut().zip(reinforced) {
+            sample.advantage = advantage;
         }
+        let centred = !matches!(signal, Signal::Uncentred(_));
 
         let width = self.network.shape().width();
         order.clear();
@@ -246,6 +291,9 @@ impl<H: Head> Player<H> {
                 }
                 let constants = self.network.constants().to_vec();
                 let mut loss = Loss::new(&self.head, batch, options, rates.entropy, &constants);
+                if !centred {
+                    loss = loss.uncentred();
+                }
                 self.network.differentiate(inputs.rows(), gradient, |block| loss.add(block));
                 let at = gradient.len() - constants.len();
                 let mut step = loss.finish(&mut gradient[at..]);
@@ -309,6 +357,13 @@ impl<'a, H: Head> Loss<'a, H> {
             by_entropy: vec![0.0; count],
             losses: Losses::default(),
         }
+    }
+
+    /// The same with advantages that are not centred, and scaled by their root mean square.
+    pub fn uncentred(self) -> Self {
+        let squares = self.samples.iter().map(|s| f64::from(s.advantage).powi(2)).sum::<f64>();
+        let scale = 1.0 / ((squares / self.samples.len() as f64).sqrt() + 1e-8);
+        Loss { mean: 0.0, scale, ..self }
     }
 
     /// Adds the samples of a block, whose y holds the actor's outputs and below them the values.

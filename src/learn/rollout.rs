@@ -4,7 +4,8 @@ use super::family::Played;
 use super::method::{Arena, Setting};
 use super::options::{Credit, TrainOptions};
 use super::pair::{LearnedOpponent, Pair, PpoPolicy};
-use super::policy::{Draw, Mode, Nominal, Opponent, Streams};
+use super::policy::{Draw, Mode, Noise, Nominal, Opponent, Streams};
+use super::price::Finished;
 use super::state::{GamesState, SlotState, Unfit};
 use super::trajectories::Trajectories;
 use super::vector_game::VectorGame;
@@ -27,9 +28,16 @@ pub struct Collector<W: World> {
     pub protagonist: Trajectories<(), W::Action>,
     /// What the antagonist recorded; empty if it did not play.
     pub antagonist: Played<W::Law>,
+    /// What its half on the protagonist's draw recorded; empty if it did not play.
+    pub action_antagonist: Played<Noise<W>>,
+    /// The return of each slot's episode before each of these draws, `[steps, slots]`; `None` in one that
+    /// started anywhere.
+    pub before_draws: Vec<Option<ReturnSoFar>>,
     /// Episodes that ended in the last rollout, without those that started anywhere; their masses have no
     /// meaning.
     pub finished: Vec<Atom>,
+    /// The same episodes with prod delta.
+    pub weighted: Vec<Finished>,
     /// max prod delta / eta over all trajectories so far, at most 1 up to rounding.
     pub budget_use: f64,
 }
@@ -67,7 +75,10 @@ impl<W: Arena> Collector<W> {
             gamma: setting.gamma,
             protagonist: Trajectories::new(slots),
             antagonist: Trajectories::new(slots),
+            action_antagonist: Trajectories::new(slots),
+            before_draws: Vec::new(),
             finished: Vec::new(),
+            weighted: Vec::new(),
             budget_use: 0.0,
         }
     }
@@ -76,7 +87,10 @@ impl<W: Arena> Collector<W> {
     pub fn collect(&mut self, pair: &Pair<W>, terms: Terms, options: &TrainOptions) {
         self.protagonist.clear();
         self.antagonist.clear();
+        self.action_antagonist.clear();
+        self.before_draws.clear();
         self.finished.clear();
+        self.weighted.clear();
         let mut policy = PpoPolicy::new(&pair.protagonist, pair.observation);
         let mut opponent = if terms.eta.is_neutral() { None } else { pair.opponent(false) };
         for slot in 0..self.game.slots() {
@@ -94,6 +108,7 @@ impl<W: Arena> Collector<W> {
             self.record_protagonist(&mut policy, options.credit);
             if let Some(opponent) = &opponent {
                 self.record_antagonist(opponent);
+                self.record_draws(opponent);
             }
             for slot in 0..self.game.slots() {
                 self.count(slot, terms);
@@ -101,11 +116,18 @@ impl<W: Arena> Collector<W> {
         }
         // The states after the last step. The antagonist's state holds an action: one is drawn for
         // this purpose only, which leaves its value unbiased.
-        self.game.choose(&mut policy, terms.mode);
+        let chance: &mut dyn Opponent<W> = match &mut opponent {
+            Some(opponent) => opponent,
+            None => &mut Nominal,
+        };
+        self.game.choose(&mut policy, terms.mode, chance, Draw::Perturbed);
         self.protagonist.inputs.extend(policy.inputs.rows());
         if let Some(opponent) = &mut opponent {
             opponent.look(&self.game.situation());
             self.antagonist.inputs.extend(opponent.inputs.rows());
+            if !self.game.noise.is_empty() {
+                self.action_antagonist.inputs.extend(opponent.draw_inputs.rows());
+            }
         }
     }
 
@@ -155,15 +177,37 @@ impl<W: Arena> Collector<W> {
         }
     }
 
+    /// Records the draws of the last step, if the antagonist reweighted them.
+    fn record_draws(&mut self, opponent: &LearnedOpponent<'_, W>) {
+        let (game, record) = (&self.game, &mut self.action_antagonist);
+        if game.noise.is_empty() {
+            return;
+        }
+        record.inputs.extend(opponent.draw_inputs.rows());
+        for (slot, (law, &noise)) in game.noise_laws.iter().zip(&game.noise).enumerate() {
+            record.given.push((*law, game.budgets_at_draw[slot]));
+            record.choices.push(noise);
+            let log_probability = law.log_density(noise) + game.draw_ratios[slot].ln();
+            record.log_probabilities.push(log_probability);
+            record.rewards.push(-game.steps[slot].reward as f32);
+            record.ended.push(game.steps[slot].end.is_some());
+            // The world counts this step already.
+            let explored = game.world.time(slot) != self.so_far[slot].steps + 1;
+            self.before_draws.push((!explored).then_some(self.so_far[slot]));
+        }
+    }
+
     /// Accumulates the last step of a slot, and starts a new episode when its own has ended.
     fn count(&mut self, slot: usize, terms: Terms) {
         let step = self.game.steps[slot];
         self.so_far[slot].add(step.reward, self.gamma);
-        self.products[slot] *= self.game.ratios[slot];
+        self.products[slot] *= self.game.likelihood_ratio(slot);
         if let Some(end) = step.end {
             let explored = self.game.world.time(slot) != self.so_far[slot].steps;
             if !explored {
                 self.finished.push(self.so_far[slot].ended(end));
+                let (value, likelihood_ratio) = (self.so_far[slot].value, self.products[slot]);
+                self.weighted.push(Finished { value, likelihood_ratio });
             }
             self.budget_use = self.budget_use.max(self.products[slot] / self.start[slot].get());
             self.begin(slot, terms);

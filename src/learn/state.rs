@@ -19,6 +19,8 @@ pub struct TrainingState<S> {
     pub protagonist: PlayerState,
     /// The antagonist; absent at eta = 1.
     pub antagonist: Option<PlayerState>,
+    /// The antagonist of the protagonist's draw; absent but in the game `joint`.
+    pub action_antagonist: Option<PlayerState>,
     /// The parallel games.
     pub games: GamesState<S>,
 }

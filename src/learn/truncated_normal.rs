@@ -60,6 +60,11 @@ impl TruncatedNormal {
         (self.mean + self.sign * self.std * z).clamp(-1.0, 1.0)
     }
 
+    /// The point as far up in this law as z is in the standard normal one.
+    pub fn at_normal(&self, z: f64) -> f64 {
+        self.quantile(below(z))
+    }
+
     /// The share of the mass below a point of [-1, 1].
     pub fn cumulative(&self, x: f64) -> f64 {
         let share = (below(self.sign * (x - self.mean) / self.std) - below(self.a)) / self.mass;

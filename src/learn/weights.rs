@@ -9,11 +9,10 @@
 //! | `PLAYER.actor.constants` | `[constants]`: log standard deviations of a Gaussian policy |
 //!
 //! `inputs` are the one-hot code of the cell, where the player sees one, and then its numbers.
-//! PLAYER is `protagonist` or `antagonist`; all f32. `outputs(x) = W2 tanh(W1 x + b1) + b2`.
+//! PLAYER is `protagonist`, `antagonist` or, in the game `joint`, `action-antagonist`; all f32. `outputs(x) = W2 tanh(W1 x + b1) + b2`.
 
 use super::device::Device;
 use super::network::{Network, Shape};
-use super::options::Role;
 use safetensors::tensor::{Dtype, SafeTensorError, SafeTensors, TensorView};
 use std::collections::{BTreeMap, HashMap};
 
@@ -37,23 +36,23 @@ pub enum WeightsError {
         found: String,
     },
     /// Numbers that no player can play with.
-    #[error("{quantity} of the {role} is not finite")]
+    #[error("{quantity} of the {player} is not finite")]
     NotFinite {
         /// Whose.
-        role: Role,
+        player: &'static str,
         /// What.
         quantity: &'static str,
     },
 }
 
-/// The networks of some players as the bytes of a safetensors file, with `about` in its header.
+/// The networks of some players, by their names, as the bytes of a safetensors file, with `about` in its header.
 ///
 /// # Errors
 /// If the format refuses a tensor.
-pub fn to_bytes(networks: &[(Role, &Network)], about: String) -> Result<Vec<u8>, WeightsError> {
+pub fn to_bytes(networks: &[(&'static str, &Network)], about: String) -> Result<Vec<u8>, WeightsError> {
     let mut tensors = BTreeMap::new();
-    for &(role, network) in networks {
-        for (name, tensor) in layout(role, network.shape()) {
+    for &(player, network) in networks {
+        for (name, tensor) in layout(player, network.shape()) {
             let bytes: Vec<u8> =
                 tensor.indices().flat_map(|at| network.parameters()[at].to_le_bytes()).collect();
             tensors.insert(name, (tensor.shape, bytes));
@@ -97,12 +96,12 @@ impl<'a> Weights<'a> {
     /// If a tensor is absent or of another shape.
     pub fn network(
         &self,
-        role: Role,
+        player: &'static str,
         shape: Shape,
         device: Device,
     ) -> Result<Network, WeightsError> {
         let mut parameters = vec![0.0; shape.parameters()];
-        for (name, tensor) in layout(role, shape) {
+        for (name, tensor) in layout(player, shape) {
             let refuse = |found: String| WeightsError::Tensor {
                 name: name.clone(),
                 expected: tensor.shape.clone(),
@@ -117,7 +116,7 @@ impl<'a> Weights<'a> {
             }
         }
         let network = Network::from_parameters(shape, parameters, device);
-        let refused = |quantity| WeightsError::NotFinite { role, quantity };
+        let refused = |quantity| WeightsError::NotFinite { player, quantity };
         network.not_finite().map_or(Ok(network), |quantity| Err(refused(quantity)))
     }
 }
@@ -140,12 +139,12 @@ impl Place {
 }
 
 /// All tensors of a player, out of the flat layout of [`crate::learn::network`].
-fn layout(role: Role, shape: Shape) -> Vec<(String, Place)> {
+fn layout(player: &str, shape: Shape) -> Vec<(String, Place)> {
     let Shape { hidden, outputs, constants, .. } = shape;
     let inputs = shape.inputs();
     let mut places = Vec::new();
     let mut add = |name: &str, shape: Vec<usize>, start, strides| {
-        places.push((format!("{role}.{name}"), Place { shape, start, strides }));
+        places.push((format!("{player}.{name}"), Place { shape, start, strides }));
     };
     let wide = 2 * hidden;
     for (net, unit, row, rows) in [("actor", 0, 0, outputs), ("critic", hidden, outputs, 1)] {

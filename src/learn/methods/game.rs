@@ -2,16 +2,18 @@
 //! rollout. At eta = 1 there is no antagonist, and every turn is the protagonist's.
 
 use crate::game::budget::Eta;
+use crate::learn::budget_sensitivity::charge_both;
 use crate::learn::family;
 use crate::learn::head::HeadOf;
 use crate::learn::inputs::Inputs;
 use crate::learn::method::{
     Arena, Method, Metric, Players, Progress, Setting, TrainError, Training,
 };
-use crate::learn::options::{Adversary, Credit, MOST_UPDATES, PlayerOptions, Role, TrainOptions};
+use crate::learn::options::{Acts, Adversary, Credit, MOST_UPDATES, PlayerOptions, Role, TrainOptions};
 use crate::learn::pair::Pair;
 use crate::learn::policy::Mode;
-use crate::learn::ppo::{Losses, Rates};
+use crate::learn::ppo::{Losses, Rates, Signal};
+use crate::learn::price;
 use crate::learn::rollout::{Collector, Terms};
 use crate::learn::state::{TrainingState, Unfit};
 use lava_envs::random::{ChaCha8Rng, Purpose, position, stream, stream_from};
@@ -48,6 +50,18 @@ impl Method for Game {
                  {0} is not; set it only for the other worlds, by env.WORLD.train.credit",
                 W::NAME
             ));
+        }
+        if options.antagonist_acts == Acts::Joint {
+            if options.credit != Credit::Chosen {
+                return Err("train.antagonist_acts = \"joint\" reweights the chosen action; use \
+                            train.credit = \"chosen\""
+                    .to_owned());
+            }
+            if options.adversary != Adversary::Learned {
+                return Err("train.antagonist_acts = \"joint\" takes the protagonist's advantages from \
+                            the antagonist that learns; use train.adversary = \"learned\""
+                    .to_owned());
+            }
         }
         <W::Action as Action>::Kind::check(options)?;
         family::family::<W::Law>(&options.family).map(|_| ())
@@ -124,20 +138,57 @@ impl<'a, W: Arena> GameTraining<'a, W> {
             Terms { eta: turn.budget, mode: turn.mode, exploring: turn.exploring },
             options,
         );
-        match (turn.role, &mut pair.antagonist) {
-            (Role::Antagonist, Some(antagonist)) => {
+        match (turn.role, &mut pair.antagonist, &mut pair.action_antagonist) {
+            (Role::Antagonist, Some(outcomes), Some(draws)) if turn.mode == Mode::Sampled => {
+                let (drawn, played) = (&collector.action_antagonist, &collector.antagonist);
+                let (its, rates, observation) = (&options.antagonist, turn.rates, pair.observation);
+                let mut by_draws = draws.estimates(drawn, gamma, its).advantages;
+                let mut by_outcomes = outcomes.estimates(played, gamma, its).advantages;
+                if options.budget_sensitivity {
+                    let more =
+                        |inputs: &mut Inputs, by| observation.with_more_budget::<W>(inputs, by);
+                    let of_outcomes = outcomes.budget_sensitivity(played, &more);
+                    let more = |inputs: &mut Inputs, by| {
+                        observation.with_more_budget_at_draw::<W>(inputs, by);
+                    };
+                    let of_draws = draws.budget_sensitivity(drawn, &more);
+                    charge_both(
+                        (&of_draws, &mut by_draws),
+                        (&of_outcomes, &mut by_outcomes),
+                        &played.ended,
+                        gamma,
+                    );
+                }
+                let signal = Signal::Given(&by_draws);
+                let of_draws = draws.update(drawn, signal, gamma, its, rates, minibatches);
+                let signal = Signal::Given(&by_outcomes);
+                let of_outcomes = outcomes.update(played, signal, gamma, its, rates, minibatches);
+                Losses::mean([of_draws, of_outcomes])
+            }
+            (Role::Antagonist, Some(antagonist), _) => {
                 let played = &collector.antagonist;
                 let observation = pair.observation;
                 let more = |inputs: &mut Inputs, by| observation.with_more_budget::<W>(inputs, by);
                 let sensitivity = options
                     .budget_sensitivity
                     .then(|| antagonist.budget_sensitivity(played, &more));
-                let (sensitivity, its) = (sensitivity.as_ref(), &options.antagonist);
-                antagonist.update(played, sensitivity, gamma, its, turn.rates, minibatches)
+                let signal = sensitivity.as_ref().map_or(Signal::Own, Signal::Charged);
+                let its = &options.antagonist;
+                antagonist.update(played, signal, gamma, its, turn.rates, minibatches)
             }
-            _ => {
+            (_, _, draws) => {
                 let (played, its) = (&collector.protagonist, &options.protagonist);
-                pair.protagonist.update(played, None, gamma, its, turn.rates, minibatches)
+                let drawn = &collector.action_antagonist;
+                let priced = draws.as_ref().filter(|_| !drawn.choices.is_empty()).map(|draws| {
+                    price::advantages(
+                        &draws.estimates(drawn, gamma, &options.antagonist),
+                        &draws.ratios(drawn),
+                        &collector.before_draws,
+                        price::value_at_risk(&collector.weighted, turn.budget),
+                    )
+                });
+                let signal = priced.as_deref().map_or(Signal::Own, Signal::Uncentred);
+                pair.protagonist.update(played, signal, gamma, its, turn.rates, minibatches)
             }
         }
     }
@@ -145,7 +196,9 @@ impl<'a, W: Arena> GameTraining<'a, W> {
     /// The first quantity of a player that is not a finite number after its update.
     fn not_finite(&self, role: Role, losses: &Losses) -> Option<&'static str> {
         losses.not_finite().or_else(|| match (role, &self.pair.antagonist) {
-            (Role::Antagonist, Some(antagonist)) => antagonist.not_finite(),
+            (Role::Antagonist, Some(antagonist)) => antagonist
+                .not_finite()
+                .or_else(|| self.pair.action_antagonist.as_ref().and_then(|of| of.not_finite())),
             _ => self.pair.protagonist.not_finite(),
         })
     }
@@ -157,6 +210,7 @@ impl<'a, W: Arena> GameTraining<'a, W> {
             minibatches: position(&self.minibatches),
             protagonist: self.pair.protagonist.state(),
             antagonist: self.pair.antagonist.as_ref().map(|antagonist| antagonist.state()),
+            action_antagonist: self.pair.action_antagonist.as_ref().map(|of| of.state()),
             games: self.collector.state(),
         }
     }
@@ -170,6 +224,11 @@ impl<'a, W: Arena> GameTraining<'a, W> {
         let done = done.ok_or(Unfit("the schedule's"))?;
         self.pair.protagonist.restore(state.protagonist)?;
         match (&mut self.pair.antagonist, state.antagonist) {
+            (Some(antagonist), Some(state)) => antagonist.restore(state)?,
+            (None, None) => {}
+            _ => return Err(Unfit("a player's")),
+        }
+        match (&mut self.pair.action_antagonist, state.action_antagonist) {
             (Some(antagonist), Some(state)) => antagonist.restore(state)?,
             (None, None) => {}
             _ => return Err(Unfit("a player's")),

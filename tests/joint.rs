@@ -1,0 +1,415 @@
+//! The game `joint`, in which the antagonist reweights the protagonist's draw as well, against `outcome`: on a
+//! world whose equilibria are known, and its budget on many trajectories.
+
+use cvar_game::experiment::config::{Config, Source};
+use cvar_game::experiment::registry::standard;
+use cvar_game::game::budget::Eta;
+use cvar_game::learn::device::Device;
+use cvar_game::learn::method::{Arena, Players, Setting, Training};
+use cvar_game::learn::methods::game::GameTraining;
+use cvar_game::learn::options::{Acts, PlaneLaw, TrainOptions};
+use cvar_game::learn::pair::Pair;
+use cvar_game::learn::play::{Play, Played, play};
+use cvar_game::learn::policy::{Draw, Mode};
+use lava_envs::action::{Discrete, Finite, uniform_index};
+use lava_envs::{
+    Action, ConfigError, End, Field, FiniteLaw, FiniteModel, GridConfig, LavaGrid, LavaPoint,
+    NoSuchState, PointConfig, Scene, Step, World, conformance,
+};
+use rand::rngs::ChaCha8Rng;
+use rand::{Rng, RngExt, SeedableRng};
+use serde::{Deserialize, Serialize};
+use std::sync::LazyLock;
+
+/// The protagonist's choice in s1.
+#[derive(Debug, Clone, Copy, PartialEq)]
+enum Bet {
+    /// a1.
+    Pass,
+    /// a2.
+    Gamble,
+}
+
+impl Action for Bet {
+    type Kind = Finite<2>;
+
+    fn uniform(random: &mut impl Rng) -> Bet {
+        uniform_index(random)
+    }
+}
+
+impl Discrete for Bet {
+    const COUNT: usize = 2;
+
+    fn index(self) -> usize {
+        self as usize
+    }
+
+    fn from_index(index: usize) -> Bet {
+        [Bet::Pass, Bet::Gamble][index]
+    }
+}
+
+/// s0 goes to s1 or s2 with probability 1/2 each. In s1 passing pays 0, gambling -1 or 1.5 with
+/// probability 1/2 each. s2 pays `safe`. The optimal CVaR_0.5 is 0, by passing.
+#[derive(Debug, Clone)]
+struct Fork {
+    constants: Constants,
+    slots: Vec<Place>,
+}
+
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+struct Constants {
+    /// What s2 pays.
+    safe: f64,
+}
+
+/// A state: s0, s1, s2 and the end.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+struct Place {
+    state: usize,
+    time: u32,
+}
+
+const START: Place = Place { state: 0, time: 0 };
+const OVER: usize = 3;
+
+impl FiniteModel for Fork {
+    fn states(&self) -> usize {
+        4
+    }
+    fn start(&self) -> usize {
+        0
+    }
+    fn actions(&self) -> usize {
+        2
+    }
+    fn outcomes(&self) -> usize {
+        2
+    }
+    fn ended(&self, state: usize) -> Option<End> {
+        (state == OVER).then_some(End::Goal)
+    }
+    fn probabilities(&self, _: usize, _: usize) -> Vec<f64> {
+        vec![0.5, 0.5]
+    }
+    fn successor(&self, state: usize, action: usize, outcome: usize) -> (usize, Step) {
+        let pays = |reward| (OVER, Step { reward, end: Some(End::Goal) });
+        match (state, action) {
+            (0, _) => (1 + outcome, Step { reward: 0.0, end: None }),
+            (1, 0) => pays(0.0),
+            (1, _) => pays([-1.0, 1.5][outcome]),
+            (2, _) => pays(self.constants.safe),
+            _ => (OVER, Step::IDLE),
+        }
+    }
+    fn intended_outcome(&self, _: usize) -> Option<usize> {
+        None
+    }
+    fn action_name(&self, action: usize) -> &'static str {
+        ["pass", "gamble"][action]
+    }
+    fn arrow(&self, _: usize) -> [f64; 2] {
+        [1.0, 0.0]
+    }
+    fn coordinates(&self, state: usize) -> [usize; 2] {
+        [state, 0]
+    }
+    fn state(&self, slot: usize) -> usize {
+        self.slots[slot].state
+    }
+    fn is_over(&self, slot: usize) -> bool {
+        self.slots[slot].state == OVER
+    }
+    fn place(&mut self, slot: usize, state: usize, time: u32) {
+        assert!(state <= OVER);
+        self.slots[slot] = Place { state, time };
+    }
+}
+
+impl World for Fork {
+    type Constants = Constants;
+    type Action = Bet;
+    type Law = FiniteLaw<2>;
+    type Snapshot = Place;
+    const NAME: &'static str = "fork";
+    const DEFAULTS: &'static str = "# What s2 pays.\nsafe = 0.9\n";
+    const OBSERVATION: usize = 2;
+    const SITUATION: usize = 3;
+
+    fn new(constants: &Constants, episodes: usize) -> Result<Self, ConfigError> {
+        Ok(Fork { constants: constants.clone(), slots: vec![START; episodes] })
+    }
+    fn constants(&self) -> &Constants {
+        &self.constants
+    }
+    fn validate(_: &Constants) -> Result<(), ConfigError> {
+        Ok(())
+    }
+    fn episodes(&self) -> usize {
+        self.slots.len()
+    }
+    fn horizon(&self) -> u32 {
+        3
+    }
+    fn reset(&mut self, slot: usize) {
+        self.slots[slot] = START;
+    }
+    fn snapshot(&self, slot: usize) -> Place {
+        self.slots[slot]
+    }
+    fn restore(&mut self, slot: usize, snapshot: Place) -> Result<(), NoSuchState> {
+        if snapshot.state > OVER {
+            return Err(NoSuchState(snapshot.state.to_string()));
+        }
+        self.slots[slot] = snapshot;
+        Ok(())
+    }
+    fn time(&self, slot: usize) -> u32 {
+        self.slots[slot].time
+    }
+    fn observe(&self, slot: usize, observation: &mut [f32]) {
+        let state = self.slots[slot].state;
+        observation.copy_from_slice(&[f32::from(state == 1), f32::from(state == 2)]);
+    }
+    fn law(&self, _: usize, _: Bet) -> FiniteLaw<2> {
+        FiniteLaw { probabilities: [0.5, 0.5] }
+    }
+    fn situation(&self, slot: usize, action: Bet, situation: &mut [f32]) {
+        self.observe(slot, &mut situation[..2]);
+        situation[2] = f32::from(action == Bet::Gamble);
+    }
+    fn clearance(&self, _: usize) -> f64 {
+        f64::INFINITY
+    }
+    fn position(&self, slot: usize) -> [f64; 2] {
+        [self.slots[slot].state as f64, 0.0]
+    }
+    fn scene(&self) -> Scene {
+        let (size, start, areas) = ([4.0, 1.0], [0.0, 0.0], Vec::new());
+        Scene { size, cells: true, start, areas, rules: String::new() }
+    }
+    fn state_columns(&self, slot: usize) -> Vec<(&'static str, Field)> {
+        vec![("state", Field::Count(self.slots[slot].state as u64))]
+    }
+    fn action_columns(action: Bet) -> Vec<(&'static str, Field)> {
+        vec![("action", Field::Count(action.index() as u64))]
+    }
+    fn outcome_columns(outcome: usize) -> Vec<(&'static str, Field)> {
+        vec![("outcome", Field::Count(outcome as u64))]
+    }
+    fn action_arrow(_: Bet) -> [f64; 2] {
+        [1.0, 0.0]
+    }
+    fn outcome_arrow(_: usize) -> [f64; 2] {
+        [1.0, 0.0]
+    }
+    fn finite(&self) -> Option<&dyn FiniteModel> {
+        Some(self)
+    }
+    fn finite_mut(&mut self) -> Option<&mut dyn FiniteModel> {
+        Some(self)
+    }
+    fn apply(&mut self, actions: &[Bet], outcomes: &[usize], steps: &mut [Step]) {
+        for slot in 0..self.slots.len() {
+            let Place { state, time } = self.slots[slot];
+            if state == OVER {
+                steps[slot] = Step::IDLE;
+                continue;
+            }
+            let (next, step) = self.successor(state, actions[slot].index(), outcomes[slot]);
+            self.slots[slot] = Place { state: next, time: time + 1 };
+            steps[slot] = step;
+        }
+    }
+}
+
+fn fork(safe: f64, slots: usize) -> Fork {
+    Fork::new(&Constants { safe }, slots).unwrap()
+}
+
+#[test]
+fn the_fork_is_a_world() {
+    conformance::check::<Fork>(&Constants { safe: 0.9 });
+}
+
+fn options(acts: Acts) -> TrainOptions {
+    let config = Config::resolve(standard().catalogue(), Source::Default, &[]).unwrap();
+    let mut options =
+        TrainOptions { antagonist_acts: acts, ..config.world("lava-grid").train.clone() };
+    options.budget_sensitivity = true;
+    options.parallel_episodes = 200;
+    options.rollout_steps = 4;
+    options.steps = std::env::var("STEPS").map_or(160_000, |s| s.parse().unwrap());
+    for player in [&mut options.protagonist, &mut options.antagonist] {
+        player.hidden = 16;
+        player.minibatch = 400;
+        player.entropy_final = 0.0;
+    }
+    options
+}
+
+static NO_OPTIONS: LazyLock<toml::Table> = LazyLock::new(toml::Table::new);
+
+fn setting(options: &TrainOptions, eta: f64, seed: u64) -> Setting<'_> {
+    let (eta, device) = (Eta::new(eta).unwrap(), Device::Cpu);
+    Setting { eta, gamma: 1.0, seed, device, options, own: &NO_OPTIONS }
+}
+
+/// P(a2 | s1) of the protagonist.
+fn gambles(pair: &Pair<Fork>) -> f64 {
+    let mut world = fork(0.9, 1);
+    world.place(0, 1, 1);
+    Players::protagonist(pair).probabilities(&world).unwrap()[1]
+}
+
+fn against<W: Arena>(
+    world: W,
+    pair: &Pair<W>,
+    (mode, draw): (Mode, Draw),
+    (eta, episodes): (f64, u64),
+) -> Played {
+    let setting = Play { mode, draw, eta: Eta::new(eta).unwrap(), gamma: 1.0, episodes, seed: 1 };
+    let (mut protagonist, mut opponent) =
+        (Players::protagonist(pair), Players::opponent(pair).unwrap());
+    play(world, protagonist.as_mut(), opponent.as_mut(), &setting, &mut ())
+}
+
+/// Large random weights for both halves of the antagonist.
+fn shaken<W: Arena>(world: &W, options: &TrainOptions, eta: f64, strength: f32) -> Pair<W> {
+    let mut pair = Pair::new(world, &setting(options, eta, 3));
+    let mut random = ChaCha8Rng::seed_from_u64(1);
+    let networks = [
+        pair.antagonist.as_mut().unwrap().network_mut(),
+        pair.action_antagonist.as_mut().unwrap().network_mut(),
+    ];
+    for network in networks {
+        network.change(|weights| {
+            for weight in weights {
+                *weight = strength * (*weight + random.random_range(-0.1f32..0.1));
+            }
+        });
+    }
+    pair
+}
+
+/// On every trajectory prod delta <= eta, E[delta] = 1 in every half step, and nominal episodes weighted by
+/// prod delta have the mean of the antagonist's own episodes.
+fn check_budget<W: Arena>(world: impl Fn() -> W, change: impl Fn(&mut TrainOptions)) {
+    let mut options = options(Acts::Joint);
+    change(&mut options);
+    for (eta, strength) in [(1.5, 1.0), (3.0, 6.0), (25.0, 1.0), (100.0, 40.0)] {
+        let pair = shaken(&world(), &options, eta, strength);
+        let of = |draw| {
+            let played = against(world(), &pair, (Mode::Sampled, draw), (eta, 2_000));
+            assert!(played.normalisation_error <= 1e-6, "{}", played.normalisation_error);
+            for episode in &played.episodes {
+                let used = episode.likelihood_ratio / eta;
+                assert!(used <= 1.0 + 1e-6, "prod delta / eta = {used} at strength {strength}");
+            }
+            let weight = |ratio: f64| if draw == Draw::Nominal { ratio } else { 1.0 };
+            let values: Vec<f64> = (played.episodes.iter())
+                .map(|episode| weight(episode.likelihood_ratio) * episode.atom.value)
+                .collect();
+            let count = values.len() as f64;
+            let mean = values.iter().sum::<f64>() / count;
+            (mean, values.iter().map(|value| (value - mean).powi(2)).sum::<f64>() / count / count)
+        };
+        let [(weighted, weighted_variance), (direct, direct_variance)] =
+            [Draw::Nominal, Draw::Perturbed].map(of);
+        let error = (weighted_variance + direct_variance).sqrt();
+        // Of few nominal episodes that weigh as much as eta the variance is not known.
+        if eta < 10.0 {
+            let off = (weighted - direct).abs();
+            assert!(off < 4.0 * error, "{weighted} against {direct}, error {error}");
+        }
+        // A greedy protagonist draws nothing.
+        let greedy = against(world(), &pair, (Mode::Greedy, Draw::Perturbed), (eta, 200));
+        assert!(greedy.episodes.iter().all(|e| e.likelihood_ratio <= eta * (1.0 + 1e-6)));
+    }
+}
+
+#[test]
+fn no_antagonist_breaks_the_budget_with_its_two_halves() {
+    check_budget(|| LavaGrid::new(&GridConfig::default(), 250).unwrap(), |_| {});
+    for policy in [PlaneLaw::Gaussian, PlaneLaw::Disc] {
+        let world = || LavaPoint::new(&PointConfig::default(), 250).unwrap();
+        check_budget(world, |options| options.policy = policy);
+    }
+}
+
+/// Under nominal chance the draws are those of the policy itself, bit for bit.
+#[test]
+fn an_antagonist_that_only_reports_changes_no_episode() {
+    let world = || LavaGrid::new(&GridConfig::default(), 50).unwrap();
+    let of = |acts| {
+        let pair = Pair::new(&world(), &setting(&options(acts), 25.0, 3));
+        let played = against(world(), &pair, (Mode::Sampled, Draw::Nominal), (25.0, 200));
+        played.episodes.iter().map(|e| (e.atom.value, e.atom.steps)).collect::<Vec<_>>()
+    };
+    assert_eq!(of(Acts::Outcome), of(Acts::Joint));
+}
+
+/// Training with a break after every update ends with the same bits as without, and weights survive
+/// their file.
+#[test]
+fn breaks_change_nothing() {
+    let mut options = options(Acts::Joint);
+    options.steps = 8 * options.rollout();
+    (options.budget_wait, options.budget_rise, options.response) = (0.1, 0.3, 0.2);
+    let setting = setting(&options, 4.0, 1);
+    let mut whole = GameTraining::new(fork(0.9, options.parallel_episodes), &setting);
+    let mut state = Training::state(&whole);
+    loop {
+        let mut broken = GameTraining::new(fork(0.9, options.parallel_episodes), &setting);
+        Training::restore(&mut broken, &state).unwrap();
+        let (expected, found) = (whole.update().unwrap(), broken.update().unwrap());
+        assert_eq!(format!("{expected:?}"), format!("{found:?}"));
+        state = Training::state(&broken);
+        assert!(state == Training::state(&whole));
+        if found.is_none() {
+            break;
+        }
+    }
+    let bytes = whole.pair.weights(String::new()).unwrap();
+    let mut other = Pair::new(&fork(0.9, 1), &Setting { seed: 9, ..setting.clone() });
+    other.load(&bytes).unwrap();
+    let parameters = |pair: &Pair<Fork>| -> Vec<f32> {
+        pair.action_antagonist.as_ref().unwrap().network().parameters().to_vec()
+    };
+    assert_eq!(parameters(&whole.pair), parameters(&other));
+    // A pair of the game `outcome` has no such half, and its file no such tensors.
+    let outcome = TrainOptions { antagonist_acts: Acts::Outcome, ..options.clone() };
+    let alone = Pair::new(&fork(0.9, 1), &Setting { options: &outcome, ..setting.clone() });
+    let error = other.load(&alone.weights(String::new()).unwrap()).unwrap_err().to_string();
+    assert!(error.contains("action-antagonist.actor.hidden.weight"), "{error}");
+}
+
+#[test]
+fn explore() {
+    for acts in [Acts::Outcome, Acts::Joint] {
+        let options = options(acts);
+        for seed in 1..=10 {
+            let setting = setting(&options, 2.0, seed);
+            let mut training = GameTraining::new(fork(0.9, options.parallel_episodes), &setting);
+            let mut path = Vec::new();
+            let mut i = 0;
+            while training.update().unwrap().is_some() {
+                i += 1;
+                if i % (options.updates() / 10) == 0 {
+                    path.push(format!("{:.2}", gambles(&training.pair)));
+                }
+            }
+            let pair = &training.pair;
+            let v = |mode| {
+                against(fork(0.9, 500), pair, (mode, Draw::Perturbed), (2.0, 20_000)).law().mean()
+            };
+            println!(
+                "{acts:?} {seed}: {} sampled value {:.3} greedy value {:.3}",
+                path.join(" "),
+                v(Mode::Sampled),
+                v(Mode::Greedy)
+            );
+        }
+    }
+}
