@@ -240,7 +240,7 @@ fn options(acts: Acts) -> TrainOptions {
     options.budget_sensitivity = true;
     options.parallel_episodes = 200;
     options.rollout_steps = 4;
-    options.steps = std::env::var("STEPS").map_or(160_000, |s| s.parse().unwrap());
+    options.steps = 160_000;
     for player in [&mut options.protagonist, &mut options.antagonist] {
         player.hidden = 16;
         player.minibatch = 400;
@@ -254,13 +254,6 @@ static NO_OPTIONS: LazyLock<toml::Table> = LazyLock::new(toml::Table::new);
 fn setting(options: &TrainOptions, eta: f64, seed: u64) -> Setting<'_> {
     let (eta, device) = (Eta::new(eta).unwrap(), Device::Cpu);
     Setting { eta, gamma: 1.0, seed, device, options, own: &NO_OPTIONS }
-}
-
-/// P(a2 | s1) of the protagonist.
-fn gambles(pair: &Pair<Fork>) -> f64 {
-    let mut world = fork(0.9, 1);
-    world.place(0, 1, 1);
-    Players::protagonist(pair).probabilities(&world).unwrap()[1]
 }
 
 fn against<W: Arena>(
@@ -383,33 +376,4 @@ fn breaks_change_nothing() {
     let alone = Pair::new(&fork(0.9, 1), &Setting { options: &outcome, ..setting.clone() });
     let error = other.load(&alone.weights(String::new()).unwrap()).unwrap_err().to_string();
     assert!(error.contains("action-antagonist.actor.hidden.weight"), "{error}");
-}
-
-#[test]
-fn explore() {
-    for acts in [Acts::Outcome, Acts::Joint] {
-        let options = options(acts);
-        for seed in 1..=10 {
-            let setting = setting(&options, 2.0, seed);
-            let mut training = GameTraining::new(fork(0.9, options.parallel_episodes), &setting);
-            let mut path = Vec::new();
-            let mut i = 0;
-            while training.update().unwrap().is_some() {
-                i += 1;
-                if i % (options.updates() / 10) == 0 {
-                    path.push(format!("{:.2}", gambles(&training.pair)));
-                }
-            }
-            let pair = &training.pair;
-            let v = |mode| {
-                against(fork(0.9, 500), pair, (mode, Draw::Perturbed), (2.0, 20_000)).law().mean()
-            };
-            println!(
-                "{acts:?} {seed}: {} sampled value {:.3} greedy value {:.3}",
-                path.join(" "),
-                v(Mode::Sampled),
-                v(Mode::Greedy)
-            );
-        }
-    }
 }

@@ -229,7 +229,8 @@ mod tests {
         choice: usize,
     ) -> (f64, f64, f32, [f64; 12]) {
         let of = |budget: f64| {
-            let logit = |i: usize| parameters[at + 2 * i] + parameters[at + 2 * i + 1] * budget.ln();
+            let logit =
+                |i: usize| parameters[at + 2 * i] + parameters[at + 2 * i + 1] * budget.ln();
             let logits: [f64; N] = std::array::from_fn(logit);
             FiniteFamily.perturbation(&logits, &law, Budget::start(Eta::new(budget).unwrap()))
         };
@@ -254,7 +255,8 @@ mod tests {
             let left = (budget / draw.1).max(1.0);
             let outcomes = half(parameters, (4, LAWS[action]), left, outcome);
             let mut path = so_far.clone();
-            for (i, (probability, _, elasticity, score)) in [draw, outcomes].into_iter().enumerate() {
+            for (i, (probability, _, elasticity, score)) in [draw, outcomes].into_iter().enumerate()
+            {
                 path.probability *= probability;
                 path.elasticities[i].push(elasticity);
                 path.scores[i].push(score);

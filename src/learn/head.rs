@@ -64,11 +64,7 @@ pub trait PolicyHead: Head<Given = ()> {
     fn noise(&self, parameters: &[f64]) -> Self::Noise;
 
     /// The action that the noise means.
-    fn realise(
-        &self,
-        parameters: &[f64],
-        noise: <Self::Noise as Law>::Outcome,
-    ) -> Self::Choice;
+    fn realise(&self, parameters: &[f64], noise: <Self::Noise as Law>::Outcome) -> Self::Choice;
 
     /// Draws an action.
     fn draw(&self, parameters: &[f64], random: &mut impl Rng) -> Self::Choice {

@@ -12,8 +12,8 @@ use super::policy::{Opponent, Policy};
 use super::state::Unfit;
 use super::weights::WeightsError;
 use crate::game::budget::Eta;
-use lava_envs::action::{Action, ActionKind};
 use lava_envs::World;
+use lava_envs::action::{Action, ActionKind};
 
 /// A world that can be trained in: its actions have a policy, its law of chance has a family of
 /// perturbations. Every world is one whose action and law are of a known kind.
@@ -27,9 +27,9 @@ pub trait Arena:
 
 impl<W> Arena for W where
     W: World<
-        Action: Action<Kind: HeadOf<<W as World>::Action> + ActionKind<Noise: Perturbed>>,
-        Law: Perturbed,
-    >
+            Action: Action<Kind: HeadOf<<W as World>::Action> + ActionKind<Noise: Perturbed>>,
+            Law: Perturbed,
+        >
 {
 }
 

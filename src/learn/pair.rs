@@ -8,8 +8,8 @@ use super::method::{Arena, Players, Setting};
 use super::observation::Observation;
 use super::options::{Acts, Adversary, Role};
 use super::policy::{
-    Draw, DrawOpponent, DrawResponse, DrawSituation, Draws, Mode, Noise, Opponent, Policy, Response,
-    Situation, Streams,
+    Draw, DrawOpponent, DrawResponse, DrawSituation, Draws, Mode, Noise, Opponent, Policy,
+    Response, Situation, Streams,
 };
 use super::ppo::Player;
 use super::weights::{self, Weights, WeightsError};
@@ -121,7 +121,8 @@ impl<W: Arena> Players<W> for Pair<W> {
         self.protagonist.network = file.network(Role::Protagonist.name(), shape, self.device)?;
         if let Some(antagonist) = &mut self.antagonist {
             let shape = antagonist.network().shape();
-            *antagonist.network_mut() = file.network(Role::Antagonist.name(), shape, self.device)?;
+            *antagonist.network_mut() =
+                file.network(Role::Antagonist.name(), shape, self.device)?;
         }
         if let Some(antagonist) = &mut self.action_antagonist {
             let shape = antagonist.network().shape();
@@ -277,7 +278,8 @@ impl<W: Arena> Opponent<W> for LearnedOpponent<'_, W> {
     }
 
     fn all_ratios(&mut self, situation: &Situation<'_, W>) -> Option<Vec<f64>> {
-        if self.pair.adversary == Adversary::Random {
+        // One that also reweights draws has more to it than these ratios.
+        if self.pair.adversary == Adversary::Random || self.pair.action_antagonist.is_some() {
             return None;
         }
         self.look(situation);

@@ -15,8 +15,8 @@
 use super::head::{GaussianPolicy, Head, HeadOf, PolicyHead};
 use super::options::{PlaneLaw, TrainOptions};
 use super::truncated_normal::TruncatedNormal;
-use lava_envs::{Force, GaussianLaw};
 use lava_envs::action::Plane;
+use lava_envs::{Force, GaussianLaw};
 use nalgebra::Vector2;
 use rand::{Rng, RngExt};
 use std::f64::consts::{FRAC_PI_2, FRAC_PI_4, PI};

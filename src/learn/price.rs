@@ -117,7 +117,7 @@ mod tests {
 
     fn continued(history: &[(usize, usize)]) -> impl Iterator<Item = History> {
         let steps = (0..3).flat_map(|action| [(action, 0), (action, 1)]);
-        steps.map(|step| [history, &[step]].concat())
+        steps.map(move |step| [history, &[step]].concat())
     }
 
     fn probability(policy: &[f64; 3], history: &[(usize, usize)]) -> f64 {
@@ -204,8 +204,8 @@ mod tests {
         fn gradient(&self, at_risk: Option<f64>) -> [f64; 3] {
             let mut gradient = [0.0; 3];
             for history in whole() {
-                let odds = probability(&self.policy, &history) * self.tail(&history)
-                    / self.tail(&[]);
+                let odds =
+                    probability(&self.policy, &history) * self.tail(&history) / self.tail(&[]);
                 if odds == 0.0 {
                     continue;
                 }
@@ -248,7 +248,8 @@ mod tests {
                 (shifted(1e-5) - shifted(-1e-5)) / 2e-5
             });
             let distance = |at_risk| {
-                let off = worst.gradient(at_risk).into_iter().zip(exact).map(|(a, b)| (a - b).abs());
+                let off =
+                    worst.gradient(at_risk).into_iter().zip(exact).map(|(a, b)| (a - b).abs());
                 off.fold(0.0, f64::max)
             };
             let priced = distance(Some(worst.at_risk));

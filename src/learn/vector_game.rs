@@ -96,7 +96,8 @@ impl<W: World> VectorGame<W> {
     ) {
         self.choose(protagonist, mode, opponent, draw);
         self.outcomes.clear();
-        let VectorGame { world, actions, laws, budgets_before: budgets, outcomes, ratios, .. } = self;
+        let VectorGame { world, actions, laws, budgets_before: budgets, outcomes, ratios, .. } =
+            self;
         let situation = Situation { world, actions, laws, budgets };
         opponent.respond(&situation, draw, &mut self.streams, Response { outcomes, ratios });
         for (slot, budget) in self.budgets.iter_mut().enumerate() {

@@ -49,7 +49,10 @@ pub enum WeightsError {
 ///
 /// # Errors
 /// If the format refuses a tensor.
-pub fn to_bytes(networks: &[(&'static str, &Network)], about: String) -> Result<Vec<u8>, WeightsError> {
+pub fn to_bytes(
+    networks: &[(&'static str, &Network)],
+    about: String,
+) -> Result<Vec<u8>, WeightsError> {
     let mut tensors = BTreeMap::new();
     for &(player, network) in networks {
         for (name, tensor) in layout(player, network.shape()) {

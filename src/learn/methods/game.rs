@@ -9,7 +9,9 @@ use crate::learn::inputs::Inputs;
 use crate::learn::method::{
     Arena, Method, Metric, Players, Progress, Setting, TrainError, Training,
 };
-use crate::learn::options::{Acts, Adversary, Credit, MOST_UPDATES, PlayerOptions, Role, TrainOptions};
+use crate::learn::options::{
+    Acts, Adversary, Credit, MOST_UPDATES, PlayerOptions, Role, TrainOptions,
+};
 use crate::learn::pair::Pair;
 use crate::learn::policy::Mode;
 use crate::learn::ppo::{Losses, Rates, Signal};
@@ -58,9 +60,11 @@ impl Method for Game {
                     .to_owned());
             }
             if options.adversary != Adversary::Learned {
-                return Err("train.antagonist_acts = \"joint\" takes the protagonist's advantages from \
+                return Err(
+                    "train.antagonist_acts = \"joint\" takes the protagonist's advantages from \
                             the antagonist that learns; use train.adversary = \"learned\""
-                    .to_owned());
+                        .to_owned(),
+                );
             }
         }
         <W::Action as Action>::Kind::check(options)?;
