@@ -19,6 +19,7 @@ use cvar_game::game::budget::{Budget, Eta};
 use cvar_game::game::finite::FiniteFamily;
 use cvar_game::game::gaussian::GaussianFamily;
 use cvar_game::game::perturbation::{Family, Perturbation};
+use cvar_game::learn::budget_sensitivity::LARGEST;
 use cvar_game::learn::device::Device;
 use cvar_game::learn::family::Named;
 use cvar_game::learn::inputs::Inputs;
@@ -160,8 +161,9 @@ fn update<W: Arena>(criterion: &mut Criterion) {
     group.bench_function(BenchmarkId::new(W::NAME, "antagonist"), |bencher| {
         bencher.iter(|| {
             let played = &collector.antagonist;
-            let sensitivity =
-                options.budget_sensitivity.then(|| player.budget_sensitivity(played, &more));
+            let sensitivity = options
+                .budget_sensitivity
+                .then(|| player.budget_sensitivity(played, &more, LARGEST));
             let signal = sensitivity.as_ref().map_or(Signal::Own, Signal::Charged);
             player.update(played, signal, 1.0, its, rates(its.entropy), random)
         });

@@ -246,6 +246,11 @@ fn options(acts: Acts) -> TrainOptions {
         player.minibatch = 400;
         player.entropy_final = 0.0;
     }
+    if acts == Acts::Joint {
+        (options.steps, options.follower_updates) = (240_000, 4);
+        (options.protagonist.entropy, options.antagonist.entropy) = (0.05, 0.0);
+        options.antagonist.gae_lambda = 1.0;
+    }
     options
 }
 
@@ -254,6 +259,13 @@ static NO_OPTIONS: LazyLock<toml::Table> = LazyLock::new(toml::Table::new);
 fn setting(options: &TrainOptions, eta: f64, seed: u64) -> Setting<'_> {
     let (eta, device) = (Eta::new(eta).unwrap(), Device::Cpu);
     Setting { eta, gamma: 1.0, seed, device, options, own: &NO_OPTIONS }
+}
+
+/// P(a2 | s1) of the protagonist.
+fn gambles(pair: &Pair<Fork>) -> f64 {
+    let mut world = fork(0.9, 1);
+    world.place(0, 1, 1);
+    Players::protagonist(pair).probabilities(&world).unwrap()[1]
 }
 
 fn against<W: Arena>(
@@ -376,4 +388,50 @@ fn breaks_change_nothing() {
     let alone = Pair::new(&fork(0.9, 1), &Setting { options: &outcome, ..setting.clone() });
     let error = other.load(&alone.weights(String::new()).unwrap()).unwrap_err().to_string();
     assert!(error.contains("action-antagonist.actor.hidden.weight"), "{error}");
+}
+
+/// Trains a pair on the fork at eta = 2; P(a2) after 40 % of the run and at its end, and the value of the
+/// game for the sampled protagonist.
+fn trained(acts: Acts, seed: u64) -> [f64; 3] {
+    let options = options(acts);
+    let setting = setting(&options, 2.0, seed);
+    let mut training = GameTraining::new(fork(0.9, options.parallel_episodes), &setting);
+    let mut early = f64::NAN;
+    while training.update().unwrap().is_some() {
+        if training.updates() == options.updates() * 2 / 5 {
+            early = gambles(&training.pair);
+        }
+    }
+    let pair = &training.pair;
+    let played = against(fork(0.9, 500), pair, (Mode::Sampled, Draw::Perturbed), (2.0, 20_000));
+    [early, gambles(pair), played.law().mean()]
+}
+
+fn mean_of_seeds(acts: Acts, seeds: u64) -> [f64; 3] {
+    let mut mean = [0.0; 3];
+    for seed in 1..=seeds {
+        for (mean, of) in mean.iter_mut().zip(trained(acts, seed)) {
+            *mean += of / seeds as f64;
+        }
+    }
+    mean
+}
+
+/// With P(a2) = 0.6 and delta(s1) = 5/3 neither player gains by deviating, and the value is 0.15, though the
+/// CVaR_0.5 of the sampled policy is -0.03.
+#[test]
+fn the_game_outcome_settles_where_no_policy_is_optimal() {
+    let [_, gamble, value] = mean_of_seeds(Acts::Outcome, 6);
+    assert!((gamble - 0.6).abs() < 0.15, "P(a2) = {gamble}");
+    assert!((value - 0.15).abs() < 0.06, "value {value}");
+}
+
+/// The value of the game is the CVaR_0.5 of the sampled policy, -0.05 P(a2), and the protagonist moves
+/// towards the optimal policy, P(a2) = 0.
+#[test]
+fn the_value_of_the_game_joint_is_the_cvar_of_the_sampled_policy() {
+    let [early, gamble, value] = mean_of_seeds(Acts::Joint, 6);
+    let gap = value + 0.05 * gamble;
+    assert!((-0.005..0.04).contains(&gap), "value {value}, P(a2) = {gamble}");
+    assert!(gamble < early - 0.03, "P(a2) goes from {early} to {gamble}");
 }

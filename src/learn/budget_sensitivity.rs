@@ -34,6 +34,10 @@ pub const STEP: f64 = 0.02;
 /// Bound of the elasticities: few are larger, but one of them can outweigh a whole minibatch.
 pub const LARGEST: f32 = 5.0;
 
+/// The same in the game `joint`, whose protagonist depends on D more closely. Where budget b binds one of two
+/// equally likely outcomes, the other one has the elasticity -b/(2-b), and without it D is far too small.
+pub const LARGEST_IN_JOINT: f32 = 100.0;
+
 /// What the antagonist's gradient needs of its budget along trajectories.
 #[derive(Debug, Clone, PartialEq)]
 pub struct BudgetSensitivity {

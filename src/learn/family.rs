@@ -5,7 +5,7 @@
 //! family is one file in `game` and one line here. The rest of the program uses an antagonist through
 //! [`Antagonist`], whatever its family.
 
-use super::budget_sensitivity::{BudgetSensitivity, LARGEST, STEP};
+use super::budget_sensitivity::{BudgetSensitivity, STEP};
 use super::device::Device;
 use super::gae::Estimates;
 use super::head::{AntagonistHead, Head};
@@ -186,11 +186,13 @@ pub trait Antagonist<L: Law>: Debug + Send {
     fn all_ratios(&self, outputs: &[f32], laws: &[L], budgets: &[Budget]) -> Option<Vec<f64>>;
 
     /// How its own spending changes its value along the recorded trajectories. `with_more_budget` turns inputs
-    /// into those that it would see with exp(the second argument) times the budget.
+    /// into those that it would see with exp(the second argument) times the budget. Elasticities are cut off
+    /// at `largest`.
     fn budget_sensitivity(
         &self,
         played: &Played<L>,
         with_more_budget: &dyn Fn(&mut Inputs, f64),
+        largest: f32,
     ) -> BudgetSensitivity;
 
     /// See [`Player::estimates`].
@@ -277,6 +279,7 @@ impl<F: Family + Send + 'static> Antagonist<F::Law> for Player<AntagonistHead<F>
         &self,
         played: &Played<F::Law>,
         with_more_budget: &dyn Fn(&mut Inputs, f64),
+        largest: f32,
     ) -> BudgetSensitivity {
         let steps = played.rewards.len();
         let mut inputs = played.inputs.clone();
@@ -294,7 +297,7 @@ impl<F: Family + Send + 'static> Antagonist<F::Law> for Player<AntagonistHead<F>
             let (law, budget) = played.given[i];
             let budget = Budget::remaining(budget.get() * STEP.exp()).unwrap_or(budget);
             let log = self.head.log_probability(&parameters, &(law, budget), &played.choices[i]);
-            (((log - played.log_probabilities[i]) / STEP) as f32).clamp(-LARGEST, LARGEST)
+            (((log - played.log_probabilities[i]) / STEP) as f32).clamp(-largest, largest)
         };
         let slope = |(richer, value): (&f32, &f32)| (richer - value) / STEP as f32;
         BudgetSensitivity {

@@ -2,7 +2,7 @@
 //! rollout. At eta = 1 there is no antagonist, and every turn is the protagonist's.
 
 use crate::game::budget::Eta;
-use crate::learn::budget_sensitivity::charge_both;
+use crate::learn::budget_sensitivity::{LARGEST, LARGEST_IN_JOINT, charge_both};
 use crate::learn::family;
 use crate::learn::head::HeadOf;
 use crate::learn::inputs::Inputs;
@@ -151,11 +151,11 @@ impl<'a, W: Arena> GameTraining<'a, W> {
                 if options.budget_sensitivity {
                     let more =
                         |inputs: &mut Inputs, by| observation.with_more_budget::<W>(inputs, by);
-                    let of_outcomes = outcomes.budget_sensitivity(played, &more);
+                    let of_outcomes = outcomes.budget_sensitivity(played, &more, LARGEST_IN_JOINT);
                     let more = |inputs: &mut Inputs, by| {
                         observation.with_more_budget_at_draw::<W>(inputs, by);
                     };
-                    let of_draws = draws.budget_sensitivity(drawn, &more);
+                    let of_draws = draws.budget_sensitivity(drawn, &more, LARGEST_IN_JOINT);
                     charge_both(
                         (&of_draws, &mut by_draws),
                         (&of_outcomes, &mut by_outcomes),
@@ -175,7 +175,7 @@ impl<'a, W: Arena> GameTraining<'a, W> {
                 let more = |inputs: &mut Inputs, by| observation.with_more_budget::<W>(inputs, by);
                 let sensitivity = options
                     .budget_sensitivity
-                    .then(|| antagonist.budget_sensitivity(played, &more));
+                    .then(|| antagonist.budget_sensitivity(played, &more, LARGEST));
                 let signal = sensitivity.as_ref().map_or(Signal::Own, Signal::Charged);
                 let its = &options.antagonist;
                 antagonist.update(played, signal, gamma, its, turn.rates, minibatches)
