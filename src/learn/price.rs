@@ -265,7 +265,7 @@ mod tests {
         // The antagonist draws 0 and 1 twice as often as chance would, and 3 rarely.
         let episodes = [of(3.0, 1e-3), of(0.0, 2.0), of(1.0, 2.0), of(0.0, 2.0), of(1.0, 2.0)];
         let at = |eta| value_at_risk(&episodes, Eta::new(eta).unwrap()).unwrap();
-        assert_eq!([at(2.0), at(5.0), at(10.0)], [1.0, 0.0, 0.0]);
+        assert_eq!([at(2.5), at(5.0), at(10.0)], [1.0, 0.0, 0.0]);
         assert_eq!(at(1.0), 3.0);
         assert_eq!(value_at_risk(&[], Eta::NEUTRAL), None);
     }
