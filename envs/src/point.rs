@@ -34,6 +34,9 @@ use rand_distr::StandardNormal;
 use rapier2d::math::Vector;
 use serde::{Deserialize, Serialize};
 
+/// Positions that are tried to scatter a slot.
+const MOST_DRAWS: usize = 1000;
+
 /// Speed that the observation maps onto 1 (m/s).
 pub const OBSERVED_SPEED: f64 = 4.0;
 
@@ -195,19 +198,18 @@ impl World for LavaPoint {
     }
 
     /// The position is uniform over where the disc touches neither lava nor goal, the velocity normal with
-    /// the noise's standard deviation.
+    /// the noise's standard deviation. Where almost nothing of the arena is free, the slot is reset.
     fn scatter(&mut self, slot: usize, random: &mut ChaCha8Rng) {
         let PointConfig { arena, radius, goal, noise, horizon, .. } = self.config;
         if horizon == 1 {
             return self.reset(slot);
         }
-        let position = loop {
+        let free = (0..MOST_DRAWS).find_map(|_| {
             let place = arena.map(|side| random.random_range(radius..=side - radius));
             let in_goal = (0..2).all(|i| (goal.min[i]..=goal.max[i]).contains(&place[i]));
-            if !in_goal && self.scene.clearance(vector(place)) > 0.0 {
-                break place;
-            }
-        };
+            (!in_goal && self.scene.clearance(vector(place)) > 0.0).then_some(place)
+        });
+        let Some(position) = free else { return self.reset(slot) };
         let fastest = physics::speed_limit(&self.config);
         let velocity: [f64; 2] = std::array::from_fn(|_| {
             let velocity = noise * random.sample::<f64, _>(StandardNormal);
