@@ -5,7 +5,7 @@ use cvar_game::experiment::config::{Config, RunConfig, Setting, Source};
 use cvar_game::experiment::names::{RunId, VariantName};
 use cvar_game::experiment::plan;
 use cvar_game::experiment::registry::standard;
-use cvar_game::game::gaussian::MAX_BUMPS;
+use cvar_game::game::gaussian::MOST;
 use cvar_game::learn::device::Device;
 use lava_envs::{LavaGrid, LavaPoint, World};
 use std::collections::BTreeMap;
@@ -168,8 +168,8 @@ fn bad_values_are_refused_with_key_value_and_range() {
         ("train.hide_budget=1", ["train.hide_budget = 1", "true or false"]),
         ("train.budget_wait=1", ["train.budget_wait = 1", "at least 0 and below 1"]),
         ("train.credit=executed", ["in which chance decides an action", "(lava-point)"]),
-        ("train.family.kind=softmax", ["use \"bumps\" or \"auto\"", "(lava-point)"]),
-        ("train.family.kind=none", ["\"none\"", "\"auto\", \"bumps\" or \"softmax\""]),
+        ("train.family.kind=softmax", ["use \"bumps\" or \"probits\" or \"auto\"", "(lava-point)"]),
+        ("train.family.kind=none", ["\"none\"", "\"auto\", \"bumps\", \"probits\" or \"softmax\""]),
         ("experiment.methods=[\"dqn\"]", ["dqn", "each element \"game\""]),
         (
             "train.family=4",
@@ -424,7 +424,7 @@ fn every_option_has_a_rule_that_its_default_follows() {
         "experiment.variant",
     ];
     assert_eq!(unstated, checked_elsewhere);
-    assert_eq!(stated["train.family.count"], format!("Range: [1, {MAX_BUMPS}]"));
+    assert_eq!(stated["train.family.count"], format!("Range: [1, {MOST}]"));
     assert_eq!(stated["experiment.envs"], "One of: \"lava-grid\", \"lava-point\"");
     assert!(!standard().catalogue().annotated_default().contains("of the program\n"));
 }

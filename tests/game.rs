@@ -3,25 +3,31 @@
 
 use approx::assert_relative_eq;
 use cvar_game::game::budget::{Budget, Eta};
-use cvar_game::game::bump::{self, Bump};
+use cvar_game::game::bump::Bump;
 use cvar_game::game::finite::FiniteFamily;
-use cvar_game::game::gaussian::{GaussianFamily, MAX_BUMPS};
+use cvar_game::game::gaussian::{Component, GaussianFamily, GaussianPerturbation, MOST};
 use cvar_game::game::perturbation::{Family, Perturbation};
+use cvar_game::game::probit::Probit;
 use lava_envs::{FiniteLaw, GaussianLaw, Law};
 use nalgebra::{Matrix2, Vector2};
 use proptest::prelude::*;
 use rand::SeedableRng;
 use rand::rngs::ChaCha8Rng;
+use std::marker::PhantomData;
+use std::ops::Range;
 
-fn family(bumps: usize) -> GaussianFamily {
-    GaussianFamily { bumps, center_bound: 4.0, curvature_bound: 50.0 }
+fn family<C: Component>(count: usize) -> GaussianFamily<C> {
+    GaussianFamily { count, center_bound: 4.0, curvature_bound: 50.0, kind: PhantomData }
 }
 
 /// A family with its parameters, the logits of its weights included.
-fn gaussians(range: std::ops::Range<f64>) -> impl Strategy<Value = (GaussianFamily, Vec<f64>)> {
-    (1..=MAX_BUMPS).prop_flat_map(move |bumps| {
-        let count = family(bumps).parameters();
-        (Just(family(bumps)), prop::collection::vec(range.clone(), count))
+fn gaussians<C: Component>(
+    range: Range<f64>,
+) -> impl Strategy<Value = (GaussianFamily<C>, Vec<f64>)> {
+    (1..=MOST).prop_flat_map(move |components| {
+        let family = family(components);
+        let count = family.parameters();
+        (Just(family), prop::collection::vec(range.clone(), count))
     })
 }
 
@@ -119,27 +125,29 @@ proptest! {
     }
 
     #[test]
-    fn gaussian_perturbations_are_admissible(
-        (family, parameters) in gaussians(-5.0..5.0),
+    fn sums_of_bumps_are_admissible(
+        (family, parameters) in gaussians::<Bump>(-5.0..5.0),
         xi in prop::array::uniform2(-5.0f64..5.0),
         eta in budgets(),
     ) {
-        let perturbation = family.perturbation(&parameters, &GaussianLaw, budget(eta));
-        prop_assert!(perturbation.supremum() <= eta * (1.0 + 1e-9));
-        let ratio = perturbation.likelihood_ratio(Vector2::from(xi));
-        prop_assert!(ratio > 0.0 || eta > 1.0);
-        prop_assert!(ratio <= perturbation.supremum() * (1.0 + 1e-12));
-        prop_assert!(perturbation.normalisation_error() < 1e-9);
-        let mut sum = 0.0;
-        for (weight, bump) in perturbation.bumps() {
+        check_admissible(&family, &parameters, Vector2::from(xi), eta)?;
+        for (_, bump) in family.perturbation(&parameters, &GaussianLaw, budget(eta)).components() {
             prop_assert!(bump.center().norm() < family.center_bound);
             let largest = bump.curvature().symmetric_eigenvalues().max();
             prop_assert!(largest <= family.curvature_bound);
-            sum += weight;
         }
-        prop_assert!((sum - 1.0).abs() < 1e-12);
-        if eta == 1.0 {
-            prop_assert_eq!(ratio, 1.0);
+    }
+
+    #[test]
+    fn sums_of_probits_are_admissible(
+        (family, parameters) in gaussians::<Probit>(-5.0..5.0),
+        xi in prop::array::uniform2(-5.0f64..5.0),
+        eta in budgets(),
+    ) {
+        check_admissible(&family, &parameters, Vector2::from(xi), eta)?;
+        for (_, step) in family.perturbation(&parameters, &GaussianLaw, budget(eta)).components() {
+            prop_assert!(step.threshold().abs() < family.center_bound);
+            prop_assert!(step.slope().norm_squared() < family.curvature_bound);
         }
     }
 
@@ -171,22 +179,68 @@ proptest! {
     }
 
     #[test]
-    fn gaussian_gradients_equal_finite_differences(
-        (family, parameters) in gaussians(-2.0..2.0),
+    fn gradients_of_bumps_equal_finite_differences(
+        (family, parameters) in gaussians::<Bump>(-2.0..2.0),
         xi in prop::array::uniform2(-3.0f64..3.0),
         eta in prop_oneof![Just(1.0), 1.05f64..200.0],
     ) {
-        let at = |x: &[f64]| family.perturbation(x, &GaussianLaw, budget(eta));
-        prop_assume!((at(&parameters).base_supremum() - eta).abs() > 1e-2 * eta);
-        let xi = Vector2::from(xi);
-        let mut gradient = vec![0.0; parameters.len()];
-        at(&parameters).score(xi, &mut gradient);
-        assert_gradient(&gradient, &differences(|x| at(x).likelihood_ratio(xi).ln(), &parameters));
-        let scratch = gradient.clone();
-        at(&parameters).entropy(&mut gradient);
-        let entropy = |x: &[f64]| at(x).entropy(&mut scratch.clone());
-        assert_gradient(&gradient, &differences(entropy, &parameters));
+        check_gradients(&family, &parameters, Vector2::from(xi), eta)?;
     }
+
+    #[test]
+    fn gradients_of_probits_equal_finite_differences(
+        (family, parameters) in gaussians::<Probit>(-2.0..2.0),
+        xi in prop::array::uniform2(-3.0f64..3.0),
+        eta in prop_oneof![Just(1.0), 1.05f64..200.0],
+    ) {
+        check_gradients(&family, &parameters, Vector2::from(xi), eta)?;
+    }
+}
+
+fn check_admissible<C: Component>(
+    family: &GaussianFamily<C>,
+    parameters: &[f64],
+    xi: Vector2<f64>,
+    eta: f64,
+) -> Result<(), TestCaseError> {
+    let perturbation = family.perturbation(parameters, &GaussianLaw, budget(eta));
+    prop_assert!(perturbation.supremum() <= eta * (1.0 + 1e-9));
+    let ratio = perturbation.likelihood_ratio(xi);
+    prop_assert!(ratio > 0.0 || eta > 1.0);
+    prop_assert!(ratio <= perturbation.supremum() * (1.0 + 1e-12));
+    prop_assert!(perturbation.normalisation_error() < 1e-9);
+    let sum: f64 = perturbation.components().map(|(weight, _)| weight).sum();
+    prop_assert!((sum - 1.0).abs() < 1e-12);
+    if eta == 1.0 {
+        prop_assert_eq!(ratio, 1.0);
+    }
+    Ok(())
+}
+
+fn check_gradients<C: Component>(
+    family: &GaussianFamily<C>,
+    parameters: &[f64],
+    xi: Vector2<f64>,
+    eta: f64,
+) -> Result<(), TestCaseError> {
+    let at = |x: &[f64]| family.perturbation(x, &GaussianLaw, budget(eta));
+    prop_assume!((at(parameters).base_supremum() - eta).abs() > 1e-2 * eta);
+    let mut gradient = vec![0.0; parameters.len()];
+    at(parameters).score(xi, &mut gradient);
+    assert_gradient(&gradient, &differences(|x| at(x).likelihood_ratio(xi).ln(), parameters));
+    let scratch = gradient.clone();
+    at(parameters).entropy(&mut gradient);
+    let entropy = |x: &[f64]| at(x).entropy(&mut scratch.clone());
+    assert_gradient(&gradient, &differences(entropy, parameters));
+    Ok(())
+}
+
+/// The perturbed density integrates to 1.
+fn check_integral<C: Component>(perturbation: &GaussianPerturbation<C>) {
+    let density =
+        |xi: Vector2<f64>| GaussianLaw.log_density(xi).exp() * perturbation.likelihood_ratio(xi);
+    let total = integrate(density, Vector2::zeros(), 10.0, 800);
+    assert!((total - 1.0).abs() < 1e-6, "E[delta] = {total}");
 }
 
 proptest! {
@@ -195,7 +249,7 @@ proptest! {
     /// Z, M, m and S of a bump against quadrature of their definitions.
     #[test]
     fn a_bump_equals_quadrature(parameters in prop::array::uniform5(-6.0f64..6.0)) {
-        let bump = Bump::new(&parameters, 0.1, 4.0, 50.0);
+        let bump = Bump::new(&parameters, 0, 4.0, 50.0);
         let (c, k) = (bump.center(), bump.curvature());
         let kernel = |xi: Vector2<f64>| {
             (GaussianLaw.log_density(xi) - 0.5 * (xi - c).dot(&(k * (xi - c)))).exp()
@@ -223,22 +277,18 @@ proptest! {
     /// The perturbed density integrates to 1, and M bounds the ratio; it is attained by one bump.
     #[test]
     fn sums_of_bumps_equal_quadrature(
-        (family, parameters) in gaussians(-6.0..6.0),
+        (family, parameters) in gaussians::<Bump>(-6.0..6.0),
         eta in prop_oneof![
             (1e-9f64..1e-3).prop_map(|x| 1.0 + x), 1.0f64..200.0, Just(1e12),
         ],
     ) {
         let perturbation = family.perturbation(&parameters, &GaussianLaw, budget(eta));
-        let density = |xi: Vector2<f64>| {
-            GaussianLaw.log_density(xi).exp() * perturbation.likelihood_ratio(xi)
-        };
-        let total = integrate(density, Vector2::zeros(), 10.0, 800);
-        prop_assert!((total - 1.0).abs() < 1e-6, "E[delta] = {total}");
-        for (_, bump) in perturbation.bumps() {
+        check_integral(&perturbation);
+        for (_, bump) in perturbation.components() {
             let c = bump.center();
             let top = perturbation.likelihood_ratio(c);
             prop_assert!(top <= perturbation.supremum() * (1.0 + 1e-12));
-            if family.bumps == 1 {
+            if family.count == 1 {
                 let supremum = perturbation.base_supremum().min(eta);
                 assert_relative_eq!(top, supremum, max_relative = 1e-9);
                 for step in 0..8 {
@@ -251,13 +301,92 @@ proptest! {
     }
 }
 
+proptest! {
+    #![proptest_config(ProptestConfig::with_cases(40))]
+
+    /// The perturbed density integrates to 1, and the ratio rises to M along w.
+    #[test]
+    fn sums_of_probits_equal_quadrature(
+        (family, parameters) in gaussians::<Probit>(-6.0..6.0),
+        eta in prop_oneof![
+            (1e-9f64..1e-3).prop_map(|x| 1.0 + x), 1.0f64..200.0, Just(1e12),
+        ],
+    ) {
+        let perturbation = family.perturbation(&parameters, &GaussianLaw, budget(eta));
+        check_integral(&perturbation);
+        for (_, step) in perturbation.components() {
+            let far = step.slope().normalize() * 1e3;
+            assert_relative_eq!(
+                step.likelihood_ratio(far).ln(), step.log_supremum(), epsilon = 1e-9
+            );
+            prop_assert!(step.likelihood_ratio(-far) < 1e-9);
+        }
+    }
+}
+
+/// At the largest bounds and with extreme parameters everything stays finite.
+#[test]
+fn extreme_probits_stay_finite() {
+    let family = GaussianFamily::<Probit> {
+        count: 1,
+        center_bound: 100.0,
+        curvature_bound: 1e6,
+        kind: PhantomData,
+    };
+    for parameters in [[1e6, 0.0, 1e6], [0.0, -1e6, -1e6], [1e-6, 0.0, 1e6], [1e6, 1e6, 0.0]] {
+        for eta in [1.0, 1.5, 1e6, 1e290] {
+            let perturbation = family.perturbation(&parameters, &GaussianLaw, budget(eta));
+            let mut random = ChaCha8Rng::seed_from_u64(7);
+            for _ in 0..100 {
+                let xi = perturbation.sample(&mut random);
+                let mut gradient = [0.0; 3];
+                let ratio = perturbation.score(xi, &mut gradient);
+                assert!(xi.iter().chain(&gradient).all(|x| x.is_finite()), "{xi} {gradient:?}");
+                assert!(ratio > 0.0 && ratio <= eta * (1.0 + 1e-9), "{ratio} of {eta}");
+            }
+        }
+    }
+}
+
+/// Draws follow the density: moments against quadrature. Steep and mild steps, likely and rare ones.
+#[test]
+fn draws_follow_their_probits() {
+    let mild = [0.1, -0.05, 0.0];
+    let steep = [-2.0, 1.0, 0.5];
+    let sum = [&mild[..], &steep, &[0.3, -0.4]].concat();
+    for parameters in [mild.to_vec(), steep.to_vec(), sum] {
+        let family = family::<Probit>(if parameters.len() > 3 { 2 } else { 1 });
+        let perturbation = family.perturbation(&parameters, &GaussianLaw, budget(6.0));
+        let mut random = ChaCha8Rng::seed_from_u64(7);
+        let n = 400_000;
+        let draws: Vec<_> = (0..n).map(|_| perturbation.sample(&mut random)).collect();
+        let moments: [fn(Vector2<f64>) -> f64; 6] = [
+            |xi| xi.x,
+            |xi| xi.y,
+            |xi| xi.x * xi.x,
+            |xi| xi.x * xi.y,
+            |xi| xi.y * xi.y,
+            |xi| xi.x.powi(2) * xi.y,
+        ];
+        for moment in moments {
+            let of_draws = draws.iter().map(|&xi| moment(xi)).sum::<f64>() / f64::from(n);
+            let weighted = |xi| {
+                let density = GaussianLaw.log_density(xi).exp();
+                moment(xi) * density * perturbation.likelihood_ratio(xi)
+            };
+            let expected = integrate(weighted, Vector2::zeros(), 10.0, 800);
+            assert!((of_draws - expected).abs() < 0.015, "{of_draws} against {expected}");
+        }
+    }
+}
+
 /// Draws follow the density: first and second moments of the mixture.
 #[test]
 fn draws_follow_their_mixture() {
     let one = [0.8, -0.5, 0.1, 0.2, 0.3].to_vec();
     let two = [one.clone(), [-0.6, 0.2, 0.4, -0.1, 0.2, 0.3, -0.2].to_vec()].concat();
     for parameters in [one, two] {
-        let family = family(parameters.len() / bump::PARAMETERS);
+        let family = family::<Bump>(parameters.len() / Bump::PARAMETERS);
         let perturbation = family.perturbation(&parameters, &GaussianLaw, budget(6.0));
         let mut random = ChaCha8Rng::seed_from_u64(7);
         let n = 400_000;
@@ -266,7 +395,7 @@ fn draws_follow_their_mixture() {
         assert!(weight > 0.05 && weight < 1.0, "the budget should bind: {weight}");
         let mut expected_mean = Vector2::zeros();
         let mut expected = Matrix2::identity() * (1.0 - weight);
-        for (share, bump) in perturbation.bumps() {
+        for (share, bump) in perturbation.components() {
             let m = bump.mean();
             expected_mean += m * (weight * share);
             expected += (bump.covariance() + m * m.transpose()) * (weight * share);
@@ -309,7 +438,7 @@ fn a_small_ratio_raises_the_budget() {
 fn a_ratio_that_rounds_to_zero_leaves_a_finite_budget() {
     // c and K at their bounds along x, and budget enough for the bump alone.
     let perturbation =
-        family(1).perturbation(&[1e6, 0.0, 1e6, 0.0, 0.0], &GaussianLaw, budget(1e6));
+        family::<Bump>(1).perturbation(&[1e6, 0.0, 1e6, 0.0, 0.0], &GaussianLaw, budget(1e6));
     assert_eq!(perturbation.weight(), 1.0);
     let ratio = perturbation.likelihood_ratio(Vector2::new(-3.0, 0.0));
     assert!(ratio > 0.0 && ratio < 1e-300, "{ratio}");

@@ -390,11 +390,18 @@ fn breaks_change_nothing() {
     assert!(error.contains("action-antagonist.actor.hidden.weight"), "{error}");
 }
 
+/// Enough training to settle: the protagonist's updates are small, so that the antagonist keeps up with it.
+fn patient() -> TrainOptions {
+    let mut options = options(Acts::Joint);
+    (options.steps, options.parallel_episodes) = (2_000_000, 100);
+    (options.protagonist.entropy, options.protagonist.learning_rate) = (0.01, 0.002);
+    options
+}
+
 /// Trains a pair on the fork at eta = 2; P(a2) after 40 % of the run and at its end, and the value of the
 /// game for the sampled protagonist.
-fn trained(acts: Acts, seed: u64) -> [f64; 3] {
-    let options = options(acts);
-    let setting = setting(&options, 2.0, seed);
+fn trained(options: &TrainOptions, seed: u64) -> [f64; 3] {
+    let setting = setting(options, 2.0, seed);
     let mut training = GameTraining::new(fork(0.9, options.parallel_episodes), &setting);
     let mut early = f64::NAN;
     while training.update().unwrap().is_some() {
@@ -410,7 +417,7 @@ fn trained(acts: Acts, seed: u64) -> [f64; 3] {
 fn mean_of_seeds(acts: Acts, seeds: u64) -> [f64; 3] {
     let mut mean = [0.0; 3];
     for seed in 1..=seeds {
-        for (mean, of) in mean.iter_mut().zip(trained(acts, seed)) {
+        for (mean, of) in mean.iter_mut().zip(trained(&options(acts), seed)) {
             *mean += of / seeds as f64;
         }
     }
@@ -434,4 +441,17 @@ fn the_value_of_the_game_joint_is_the_cvar_of_the_sampled_policy() {
     let gap = value + 0.05 * gamble;
     assert!((-0.005..0.04).contains(&gap), "value {value}, P(a2) = {gamble}");
     assert!(gamble < early - 0.03, "P(a2) goes from {early} to {gamble}");
+}
+
+/// With patience both the greedy and the sampled protagonist come within 0.02 of the optimal CVaR, 0. The
+/// settings were chosen on seeds 1 to 10.
+#[test]
+#[ignore = "a minute with --release, three without: ten runs of two million steps"]
+fn the_game_joint_ends_at_the_optimal_policy() {
+    for seed in 101..=110 {
+        let [_, gamble, value] = trained(&patient(), seed);
+        println!("seed {seed}: P(a2) {gamble:.3}, CVaR {:.3}, value {value:.3}", -0.05 * gamble);
+        assert!(gamble < 0.5, "seed {seed}: greedily it gambles, P(a2) = {gamble}");
+        assert!(0.05 * gamble < 0.02, "seed {seed}: P(a2) = {gamble}");
+    }
 }

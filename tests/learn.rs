@@ -2,8 +2,10 @@
 //! budget over many trajectories of antagonists that nobody trained.
 
 use cvar_game::game::budget::{Budget, Eta};
+use cvar_game::game::bump::Bump;
 use cvar_game::game::finite::FiniteFamily;
-use cvar_game::game::gaussian::{GaussianFamily, MAX_BUMPS};
+use cvar_game::game::gaussian::{Component, GaussianFamily, MOST};
+use cvar_game::game::probit::Probit;
 use cvar_game::learn::adam::Adam;
 use cvar_game::learn::device::Device;
 use cvar_game::learn::head::{AntagonistHead, CategoricalPolicy, GaussianPolicy, Head, PolicyHead};
@@ -13,7 +15,8 @@ use cvar_game::learn::methods::game::{GameTraining, schedule};
 use cvar_game::learn::network::{Network, Outputs, Shape};
 use cvar_game::learn::observation::Observation;
 use cvar_game::learn::options::{
-    Acts, Adversary, Credit, FamilyOptions, PlaneLaw, PlayerOptions, Role, TrainOptions, View,
+    Acts, Adversary, Credit, CriticSees, FamilyOptions, PlaneLaw, PlayerOptions, Role,
+    TrainOptions, View,
 };
 use cvar_game::learn::pair::Pair;
 use cvar_game::learn::plane::DiscPolicy;
@@ -22,6 +25,7 @@ use cvar_game::learn::policy::{Draw, Mode, Nominal, Situation};
 use cvar_game::learn::ppo::{Loss, Sample};
 use cvar_game::learn::rollout::{Collector, Terms};
 use cvar_game::learn::state::TrainingState;
+use cvar_game::learn::weights::{self, Weights};
 use lava_envs::action::Discrete;
 use lava_envs::law::{FiniteLaw, GaussianLaw};
 use lava_envs::{
@@ -31,6 +35,7 @@ use lava_envs::{
 use nalgebra::Vector2;
 use rand::rngs::ChaCha8Rng;
 use rand::{RngExt, SeedableRng};
+use std::marker::PhantomData;
 use std::sync::LazyLock;
 
 fn player() -> PlayerOptions {
@@ -66,6 +71,7 @@ fn options() -> TrainOptions {
         observation: View::Coordinates,
         adversary: Adversary::Learned,
         antagonist_acts: Acts::Outcome,
+        critic_sees: CriticSees::Observation,
         hide_budget: false,
         budget_sensitivity: true,
         protagonist: player(),
@@ -220,16 +226,22 @@ fn the_loss_gradient_equals_finite_differences_for_every_head() {
     });
     check_loss_gradient(&finite, &drawn, &[], 3);
 
-    for bumps in 1..=MAX_BUMPS {
-        let family = GaussianFamily { bumps, center_bound: 4.0, curvature_bound: 50.0 };
-        let sum = AntagonistHead(family);
-        let drawn = samples(&sum, 12, &[], |r| {
-            let budget = Budget::start(eta(r.random_range(1.0..30.0)));
-            let xi = Vector2::new(r.random_range(-2.0..2.0), r.random_range(-2.0..2.0));
-            ((GaussianLaw, budget), xi)
-        });
-        check_loss_gradient(&sum, &drawn, &[], 4);
+    for count in 1..=MOST {
+        check_gaussian_gradient::<Bump>(count);
+        check_gaussian_gradient::<Probit>(count);
     }
+}
+
+fn check_gaussian_gradient<C: Component>(count: usize) {
+    let family =
+        GaussianFamily::<C> { count, center_bound: 4.0, curvature_bound: 50.0, kind: PhantomData };
+    let sum = AntagonistHead(family);
+    let drawn = samples(&sum, 12, &[], |r| {
+        let budget = Budget::start(eta(r.random_range(1.0..30.0)));
+        let xi = Vector2::new(r.random_range(-2.0..2.0), r.random_range(-2.0..2.0));
+        ((GaussianLaw, budget), xi)
+    });
+    check_loss_gradient(&sum, &drawn, &[], 4);
 }
 
 /// A cell is what its one-hot code would be in its place: outputs and gradients of a network that takes it as
@@ -238,8 +250,8 @@ fn the_loss_gradient_equals_finite_differences_for_every_head() {
 fn a_cell_is_its_one_hot_code() {
     let (cells, numbers, samples) = (7, 2, 45);
     let shape = |columns| Shape { columns, hidden: 16, outputs: 3, constants: 0 };
-    let indexed = shape(Columns { cells, numbers });
-    let dense = shape(Columns { cells: 0, numbers: cells + numbers });
+    let indexed = shape(Columns { cells, numbers, critic_only: 0 });
+    let dense = shape(Columns { cells: 0, numbers: cells + numbers, critic_only: 0 });
     let mut random = ChaCha8Rng::seed_from_u64(4);
     let parameters = Network::new(indexed, &[], Device::Cpu, &mut random).parameters().to_vec();
     let (mut short, mut long) = (Inputs::default(), Inputs::default());
@@ -271,6 +283,67 @@ fn a_cell_is_its_one_hot_code() {
     }
 }
 
+/// What the actor does not see changes nothing of what it does, now or after learning; the critic sees it.
+#[test]
+fn what_only_the_critic_sees_is_hidden_from_the_actor() {
+    let columns = Columns { cells: 5, numbers: 3, critic_only: 2 };
+    let shape = Shape { columns, hidden: 16, outputs: 3, constants: 1 };
+    let mut random = ChaCha8Rng::seed_from_u64(4);
+    let mut network = Network::new(shape, &[0.5], Device::Cpu, &mut random);
+    let inputs = |hidden: f32| Inputs {
+        cells: vec![2, 4],
+        numbers: [[0.3, hidden, -hidden, 1.0], [-0.8, hidden, 2.0 * hidden, 1.0]].concat(),
+    };
+    let mut gradient = Vec::new();
+    for round in 0..3 {
+        let outputs = [0.0, 0.7].map(|hidden| {
+            let (mut outputs, mut values) = (Vec::new(), Vec::new());
+            network.act(inputs(hidden).rows(), &mut outputs);
+            network.values(inputs(hidden).rows(), &mut values);
+            (outputs, values)
+        });
+        assert_eq!(outputs[0].0, outputs[1].0, "round {round}");
+        assert_ne!(outputs[0].1, outputs[1].1, "round {round}");
+        network.differentiate(inputs(0.7).rows(), &mut gradient, |block| block.y.fill(0.3));
+        network.change(|weights| {
+            weights.iter_mut().zip(&gradient).for_each(|(weight, by)| *weight -= 0.1 * by);
+        });
+    }
+    // The file of the weights has no room for them either, and brings back the same network.
+    let bytes = weights::to_bytes(&[("protagonist", &network)], String::new()).unwrap();
+    let file = Weights::read(&bytes).unwrap();
+    let read = file.network("protagonist", shape, Device::Cpu).unwrap();
+    assert_eq!(read.parameters(), network.parameters());
+}
+
+/// The critic's own columns: the time, where the protagonist does not see it, and the budget.
+#[test]
+fn the_critic_may_see_time_and_budget() {
+    let mut options = options();
+    options.critic_sees = CriticSees::Game;
+    let mut grid = LavaGrid::new(&GridConfig::default(), 2).unwrap();
+    grid.place(1, 17, 10);
+    let budgets = [5.0, 1.0].map(|budget| Budget::start(eta(budget)));
+    for (time_aware, expected) in [
+        (false, [[-1.0, -1.0, 0.5, -1.0, 1.0], [0.0, 0.0, 0.0, -0.5, 1.0]]),
+        (true, [[-1.0, -1.0, -1.0, 0.5, 1.0], [0.0, 0.0, -0.5, 0.0, 1.0]]),
+    ] {
+        options.protagonist.time_aware = time_aware;
+        let observation = Observation::new(&grid, &options, eta(25.0));
+        let columns = observation.protagonist_columns::<LavaGrid>();
+        assert_eq!((columns.numbers, columns.critic_only), (4, if time_aware { 1 } else { 2 }));
+        let mut seen = Inputs::default();
+        observation.protagonist(&grid, &mut seen);
+        let alone = seen.numbers.clone();
+        observation.show_budgets::<LavaGrid>(&budgets, &mut seen.numbers);
+        for (slot, (row, alone)) in seen.numbers.chunks(5).zip(alone.chunks(5)).enumerate() {
+            assert_eq!(row[2..], expected[slot][2..], "slot {slot}");
+            let visible = columns.numbers - columns.critic_only;
+            assert_eq!(row[..visible], alone[..visible]);
+        }
+    }
+}
+
 /// What both players see as features: the cell, or cell and action together, and the waves of time and place.
 #[test]
 fn features_tell_states_and_actions_apart() {
@@ -285,7 +358,7 @@ fn features_tell_states_and_actions_apart() {
     let mut seen = Inputs::default();
     observation.protagonist(&grid, &mut seen);
     assert_eq!((&seen.cells[..], &seen.numbers[..]), (&[0, 17, 69][..], &[1.0; 3][..]));
-    let columns = Columns { cells: 70, numbers: 0 };
+    let columns = Columns { cells: 70, numbers: 0, critic_only: 0 };
     assert_eq!(observation.protagonist_columns::<LavaGrid>(), columns);
     let actions = [Move::Up, Move::Left, Move::Down];
     let laws: Vec<_> = actions.iter().enumerate().map(|(i, &a)| grid.law(i, a)).collect();

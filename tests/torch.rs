@@ -13,7 +13,7 @@ use tch::{Kind, Tensor};
 /// that mixes all of y.
 #[test]
 fn network_gradients_equal_autograd() {
-    let columns = Columns { cells: 0, numbers: 5 };
+    let columns = Columns { cells: 0, numbers: 5, critic_only: 0 };
     let shape = Shape { columns, hidden: 16, outputs: 3, constants: 2 };
     let mut random = ChaCha8Rng::seed_from_u64(5);
     let mut network = Network::new(shape, &[0.2, -0.4], Device::Cpu, &mut random);

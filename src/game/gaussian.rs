@@ -1,56 +1,95 @@
-//! The Gaussian family (point mass): a weighted sum of bumps of likelihood ratio in noise space.
+//! The Gaussian families (point mass): weighted sums of likelihood ratios in noise space, of one kind each.
 //!
-//! `delta^0 = sum_j w_j delta^0_j` with [`Bump`]s delta^0_j and weights w = softmax(logits). One bump
-//! can shift the noise; two can at once shift it a little and raise the odds of a rare gust. Then
-//! `sup delta^0 <= M = sum_j w_j M_j`, with equality for one bump, and identity mixing by this M keeps
-//! the budget. The perturbed law is the mixture of N(0, I), with weight lambda, and N(m_j, S_j), with
-//! weights (1 - lambda) w_j.
+//! `delta^0 = sum_j w_j delta^0_j` with normalised ratios delta^0_j of one kind of [`Component`], such as
+//! [`super::bump::Bump`], and weights w = softmax(logits). One can shift the noise; two can at once shift it a
+//! little and raise the odds of a rare gust. Then `sup delta^0 <= M = sum_j w_j M_j`, with equality for one,
+//! and identity mixing by this M keeps the budget. The perturbed law is the mixture of N(0, I), with weight
+//! lambda, and the laws P delta^0_j, with weights (1 - lambda) w_j.
 
 use crate::game::budget::{Budget, Mixing};
-use crate::game::bump::{self, Bump};
 use crate::game::perturbation::{Family, Perturbation};
 use lava_envs::GaussianLaw;
 use nalgebra::Vector2;
 use rand::{Rng, RngExt};
 use rand_distr::StandardNormal;
+use std::marker::PhantomData;
 
-/// The most bumps of a family.
-pub const MAX_BUMPS: usize = 3;
+/// The most components of a sum.
+pub const MOST: usize = 3;
 
-/// What zero parameters mean on the diagonal of each bump's L, before squashing: a mild round bump
-/// first, then narrower ones.
-const NEUTRAL_DIAGONAL: [f64; MAX_BUMPS] = [0.1, 0.3, 0.6];
+/// A normalised likelihood ratio delta^0_j of the standard normal law.
+pub trait Component: Copy + std::fmt::Debug + Send + 'static {
+    /// Number of its parameters.
+    const PARAMETERS: usize;
 
-/// The Gaussian family. Its parameters are those of each bump and then, of several bumps, the logits
-/// of their weights.
+    /// The ratio with these parameters (any real numbers) as the component of this index in a sum. `center` bounds how
+    /// far from 0 it raises the odds, in standard deviations, `curvature` how steep it is, per squared
+    /// standard deviation.
+    fn new(parameters: &[f64], index: usize, center: f64, curvature: f64) -> Self;
+
+    /// log M_j, with M_j = sup delta^0_j.
+    fn log_supremum(&self) -> f64;
+
+    /// delta^0_j(xi).
+    fn likelihood_ratio(&self, xi: Vector2<f64>) -> f64;
+
+    /// A draw from P delta^0_j, made of a standard normal draw z.
+    fn draw<R: Rng>(&self, z: Vector2<f64>, random: &mut R) -> Vector2<f64>;
+
+    /// By how much the entropy of P delta^0_j in nats is below that of P, or an upper bound of it.
+    fn lost_entropy(&self) -> f64;
+
+    /// Writes the gradient by the parameters of `by_ratio log delta^0_j(xi) + by_supremum log M_j
+    /// + by_lost lost_entropy`.
+    fn pull_back(&self, xi: Vector2<f64>, by: Gradient, gradient: &mut [f64]);
+
+    /// `E_P[delta^0_j]` - 1, evaluated in another way than the ratio itself.
+    fn normalisation_error(&self) -> f64;
+}
+
+/// What a gradient is made of, see [`Component::pull_back`].
 #[derive(Debug, Clone, Copy)]
-pub struct GaussianFamily {
-    /// Number of bumps, 1 to [`MAX_BUMPS`].
-    pub bumps: usize,
-    /// Bound of |c|.
+pub struct Gradient {
+    /// Derivative by log delta^0_j(xi).
+    pub by_ratio: f64,
+    /// Derivative by log M_j.
+    pub by_supremum: f64,
+    /// Derivative by the lost entropy.
+    pub by_lost: f64,
+}
+
+/// A Gaussian family. Its parameters are those of each component and then, of several, the logits of their
+/// weights.
+#[derive(Debug, Clone, Copy)]
+pub struct GaussianFamily<C> {
+    /// Number of components, 1 to [`MOST`].
+    pub count: usize,
+    /// See [`Component::new`].
     pub center_bound: f64,
-    /// Bound of the eigenvalues of K.
+    /// See [`Component::new`].
     pub curvature_bound: f64,
+    /// The kind of the components.
+    pub kind: PhantomData<C>,
 }
 
 /// An admissible perturbation of the standard normal law.
 #[derive(Debug, Clone)]
-pub struct GaussianPerturbation {
-    /// The bumps; those after the first `count` have weight 0.
-    bumps: [Bump; MAX_BUMPS],
-    weights: [f64; MAX_BUMPS],
+pub struct GaussianPerturbation<C> {
+    /// The components; those after the first `count` have weight 0.
+    components: [C; MOST],
+    weights: [f64; MOST],
     count: usize,
     /// M.
     supremum: f64,
     mixing: Mixing,
 }
 
-impl Family for GaussianFamily {
+impl<C: Component> Family for GaussianFamily<C> {
     type Law = GaussianLaw;
-    type Perturbation = GaussianPerturbation;
+    type Perturbation = GaussianPerturbation<C>;
 
     fn parameters(&self) -> usize {
-        bump::PARAMETERS * self.bumps + if self.bumps > 1 { self.bumps } else { 0 }
+        C::PARAMETERS * self.count + if self.count > 1 { self.count } else { 0 }
     }
 
     fn perturbation(
@@ -58,38 +97,38 @@ impl Family for GaussianFamily {
         parameters: &[f64],
         _law: &GaussianLaw,
         budget: Budget,
-    ) -> GaussianPerturbation {
-        let count = self.bumps;
-        let bump = |j: usize| {
-            let own = &parameters[bump::PARAMETERS * j..][..bump::PARAMETERS];
-            Bump::new(own, NEUTRAL_DIAGONAL[j], self.center_bound, self.curvature_bound)
+    ) -> GaussianPerturbation<C> {
+        let count = self.count;
+        let component = |j: usize| {
+            let own = &parameters[C::PARAMETERS * j..][..C::PARAMETERS];
+            C::new(own, j, self.center_bound, self.curvature_bound)
         };
-        let mut bumps = [bump(0); MAX_BUMPS];
+        let mut components = [component(0); MOST];
         let mut weights = [1.0, 0.0, 0.0];
         if count > 1 {
-            let logits = &parameters[bump::PARAMETERS * count..][..count];
+            let logits = &parameters[C::PARAMETERS * count..][..count];
             let highest = logits.iter().copied().fold(f64::NEG_INFINITY, f64::max);
             for (j, logit) in logits.iter().enumerate() {
-                bumps[j] = bump(j);
+                components[j] = component(j);
                 weights[j] = (logit - highest).exp();
             }
             let sum: f64 = weights[..count].iter().sum();
             weights[..count].iter_mut().for_each(|weight| *weight /= sum);
         }
         let log_supremum = if count == 1 {
-            bumps[0].log_supremum()
+            components[0].log_supremum()
         } else {
-            (0..count).map(|j| weights[j] * bumps[j].log_supremum().exp()).sum::<f64>().ln()
+            (0..count).map(|j| weights[j] * components[j].log_supremum().exp()).sum::<f64>().ln()
         };
         let mixing = budget.mix(log_supremum);
-        GaussianPerturbation { bumps, weights, count, supremum: log_supremum.exp(), mixing }
+        GaussianPerturbation { components, weights, count, supremum: log_supremum.exp(), mixing }
     }
 }
 
-impl GaussianPerturbation {
-    /// The bumps with their weights w_j.
-    pub fn bumps(&self) -> impl Iterator<Item = (f64, &Bump)> {
-        self.weights[..self.count].iter().copied().zip(&self.bumps)
+impl<C: Component> GaussianPerturbation<C> {
+    /// The components with their weights w_j.
+    pub fn components(&self) -> impl Iterator<Item = (f64, &C)> {
+        self.weights[..self.count].iter().copied().zip(&self.components)
     }
 
     /// M, the bound of sup delta^0.
@@ -97,35 +136,36 @@ impl GaussianPerturbation {
         self.supremum
     }
 
-    /// 1 - lambda, the share of the bumps in the mixture.
+    /// 1 - lambda, the share of the components in the mixture.
     pub fn weight(&self) -> f64 {
         self.mixing.weight
     }
 
     /// delta^0(xi).
     fn base(&self, xi: Vector2<f64>) -> f64 {
-        self.bumps().map(|(weight, bump)| weight * bump.likelihood_ratio(xi)).sum()
+        self.components().map(|(weight, of)| weight * of.likelihood_ratio(xi)).sum()
     }
 
-    /// Writes the gradient by the parameters of a sum over the bumps j, given how it depends on
-    /// (log w_j with log delta^0_j(xi), log w_j with log M_j, log|I+K_j|, w_j alone).
+    /// Writes the gradient by the parameters of a sum over the components j, given how it depends on
+    /// each of them, log w_j with log delta^0_j(xi) and log M_j, and on w_j alone.
     fn pull_back(
         &self,
         xi: Vector2<f64>,
         gradient: &mut [f64],
-        by: impl Fn(f64, &Bump) -> [f64; 4],
+        by: impl Fn(f64, &C) -> (Gradient, f64),
     ) {
-        let mut by_logarithm = [0.0; MAX_BUMPS];
-        for (j, (weight, bump)) in self.bumps().enumerate() {
-            let [by_ratio, by_supremum, by_determinant, by_weight] = by(weight, bump);
-            let own = &mut gradient[bump::PARAMETERS * j..][..bump::PARAMETERS];
-            bump.pull_back(xi, by_ratio, by_supremum, by_determinant, own);
+        let mut by_logarithm = [0.0; MOST];
+        for (j, (weight, component)) in self.components().enumerate() {
+            let (of_component, by_weight) = by(weight, component);
+            let own = &mut gradient[C::PARAMETERS * j..][..C::PARAMETERS];
+            component.pull_back(xi, of_component, own);
+            let Gradient { by_ratio, by_supremum, .. } = of_component;
             by_logarithm[j] = by_ratio + by_supremum + by_weight * weight;
         }
         if self.count > 1 {
             // dlog w_j / d logit_k = [j = k] - w_k.
             let sum: f64 = by_logarithm.iter().sum();
-            let logits = &mut gradient[bump::PARAMETERS * self.count..][..self.count];
+            let logits = &mut gradient[C::PARAMETERS * self.count..][..self.count];
             for (k, logit) in logits.iter_mut().enumerate() {
                 *logit = by_logarithm[k] - self.weights[k] * sum;
             }
@@ -133,7 +173,7 @@ impl GaussianPerturbation {
     }
 }
 
-impl Perturbation for GaussianPerturbation {
+impl<C: Component> Perturbation for GaussianPerturbation<C> {
     type Law = GaussianLaw;
 
     fn likelihood_ratio(&self, xi: Vector2<f64>) -> f64 {
@@ -144,19 +184,19 @@ impl Perturbation for GaussianPerturbation {
         self.mixing.likelihood_ratio(self.supremum)
     }
 
-    /// lambda: far from the bumps delta^0 tends to 0.
+    /// lambda: every delta^0_j tends to 0 somewhere.
     fn infimum(&self) -> f64 {
         1.0 - self.mixing.weight
     }
 
-    /// A draw from the mixture of N(0, I) and the N(m_j, S_j).
+    /// A draw from the mixture of N(0, I) and the laws of the components.
     fn sample<R: Rng>(&self, random: &mut R) -> Vector2<f64> {
         let mut level = random.random::<f64>();
         let z = Vector2::new(random.sample(StandardNormal), random.sample(StandardNormal));
-        for (weight, bump) in self.bumps() {
+        for (weight, component) in self.components() {
             level -= self.mixing.weight * weight;
             if level < 0.0 {
-                return bump.place(z);
+                return component.draw(z, random);
             }
         }
         z
@@ -167,33 +207,31 @@ impl Perturbation for GaussianPerturbation {
         let ratio = self.mixing.likelihood_ratio(base);
         // delta = 1 + rho (delta^0 - 1), and rho depends on log M.
         let (_, by_supremum) = self.mixing.derivatives(base);
-        self.pull_back(xi, gradient, |weight, bump| {
-            let by_ratio = self.mixing.weight * weight * bump.likelihood_ratio(xi) / ratio;
-            let share = weight * bump.log_supremum().exp() / self.supremum;
-            [by_ratio, by_supremum * share / ratio, 0.0, 0.0]
+        self.pull_back(xi, gradient, |weight, of| {
+            let by_ratio = self.mixing.weight * weight * of.likelihood_ratio(xi) / ratio;
+            let share = weight * of.log_supremum().exp() / self.supremum;
+            let by_supremum = by_supremum * share / ratio;
+            (Gradient { by_ratio, by_supremum, by_lost: 0.0 }, 0.0)
         });
         ratio
     }
 
     /// The entropy of a mixture has no closed form. By concavity it is at least
-    /// `lambda H(N(0,I)) + (1-lambda) sum_j w_j H(N(m_j,S_j))
-    /// = 1 + log 2 pi - (1-lambda)/2 sum_j w_j log|I+K_j|`, which is the bonus.
+    /// `H(N(0,I)) - (1-lambda) sum_j w_j (lost entropy of P delta^0_j)`, which is the bonus.
     fn entropy(&self, gradient: &mut [f64]) -> f64 {
-        let lost: f64 = self.bumps().map(|(weight, bump)| weight * bump.log_determinant()).sum();
-        let by_supremum = -0.5 * lost * self.mixing.by_log_supremum;
-        self.pull_back(Vector2::zeros(), gradient, |weight, bump| {
-            let share = weight * bump.log_supremum().exp() / self.supremum;
-            let by_weight = -0.5 * self.mixing.weight * bump.log_determinant();
-            [0.0, by_supremum * share, -0.5 * self.mixing.weight * weight, by_weight]
+        let lost: f64 = self.components().map(|(weight, of)| weight * of.lost_entropy()).sum();
+        let by_supremum = -lost * self.mixing.by_log_supremum;
+        self.pull_back(Vector2::zeros(), gradient, |weight, of| {
+            let share = weight * of.log_supremum().exp() / self.supremum;
+            let by_lost = -self.mixing.weight * weight;
+            let by_weight = -self.mixing.weight * of.lost_entropy();
+            (Gradient { by_ratio: 0.0, by_supremum: by_supremum * share, by_lost }, by_weight)
         });
-        1.0 + (2.0 * std::f64::consts::PI).ln() - 0.5 * self.mixing.weight * lost
+        1.0 + (2.0 * std::f64::consts::PI).ln() - self.mixing.weight * lost
     }
 
-    /// From the integrals of the bumps, each evaluated with a decomposition of K of its own.
     fn normalisation_error(&self) -> f64 {
-        let off = |(weight, bump): (f64, &Bump)| {
-            weight * (bump.log_supremum() + bump.log_integral()).exp_m1()
-        };
-        self.mixing.weight * self.bumps().map(off).sum::<f64>().abs()
+        let off = |(weight, of): (f64, &C)| weight * of.normalisation_error();
+        self.mixing.weight * self.components().map(off).sum::<f64>().abs()
     }
 }

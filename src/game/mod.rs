@@ -5,4 +5,6 @@ pub mod bump;
 pub mod finite;
 pub mod gaussian;
 pub mod perturbation;
+pub mod probit;
 pub mod returns;
+pub mod squashed;

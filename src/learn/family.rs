@@ -17,14 +17,17 @@ use super::ppo::{Losses, Player, Rates, Signal};
 use super::state::{PlayerState, Unfit};
 use super::trajectories::Trajectories;
 use crate::game::budget::Budget;
+use crate::game::bump::Bump;
 use crate::game::finite::FiniteFamily;
 use crate::game::gaussian::GaussianFamily;
 use crate::game::perturbation::{Family, Perturbation};
+use crate::game::probit::Probit;
 use lava_envs::random::ChaCha8Rng;
 use lava_envs::{FiniteLaw, GaussianLaw, Law};
 use rand::RngExt;
 use rand_distr::StandardNormal;
 use std::fmt::Debug;
+use std::marker::PhantomData;
 
 /// What an antagonist records: the nominal law and the budget it acted within, and the outcome.
 pub type Played<L> = Trajectories<(L, Budget), <L as Law>::Outcome>;
@@ -40,7 +43,8 @@ impl<const N: usize> Perturbed for FiniteLaw<N> {
 }
 
 impl Perturbed for GaussianLaw {
-    const FAMILIES: &'static [FamilyEntry<Self>] = &[FamilyEntry::of::<GaussianFamily>()];
+    const FAMILIES: &'static [FamilyEntry<Self>] =
+        &[FamilyEntry::of::<GaussianFamily<Bump>>(), FamilyEntry::of::<GaussianFamily<Probit>>()];
 }
 
 /// A family that can be chosen by its name.
@@ -83,16 +87,25 @@ impl<const N: usize> Named for FiniteFamily<N> {
     }
 }
 
-impl Named for GaussianFamily {
+impl Named for GaussianFamily<Bump> {
     const KIND: &'static str = "bumps";
 
     fn with(options: &FamilyOptions) -> Self {
-        GaussianFamily {
-            bumps: options.count,
-            center_bound: options.center,
-            curvature_bound: options.curvature,
-        }
+        gaussian(options)
     }
+}
+
+impl Named for GaussianFamily<Probit> {
+    const KIND: &'static str = "probits";
+
+    fn with(options: &FamilyOptions) -> Self {
+        gaussian(options)
+    }
+}
+
+fn gaussian<C>(options: &FamilyOptions) -> GaussianFamily<C> {
+    let &FamilyOptions { count, center: center_bound, curvature: curvature_bound, .. } = options;
+    GaussianFamily { count, center_bound, curvature_bound, kind: PhantomData }
 }
 
 impl<L: Law> FamilyEntry<L> {

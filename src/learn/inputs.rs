@@ -8,6 +8,8 @@ pub struct Columns {
     pub cells: usize,
     /// Numbers of a sample, without the constant 1.
     pub numbers: usize,
+    /// How many of them, the last ones, only the critic sees.
+    pub critic_only: usize,
 }
 
 /// A batch of n samples. A cell stands for its one-hot code, whose product with a matrix is one of the

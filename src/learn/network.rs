@@ -18,6 +18,8 @@
 //! All parameters are in one flat vector `[W' | V | b | c]`, where c are the constants of the
 //! actor's head, which do not depend on the observation (the log standard deviations of a Gaussian policy).
 //!
+//! What only the critic sees has weights 0 in the actor's half of W, and stays so: their gradient is left out.
+//!
 //! The passes are computed by `fused` on the processor and by `tensors`, which is libtorch, on
 //! other devices; a test checks that the two agree with each other and with libtorch's own derivatives.
 
@@ -51,6 +53,11 @@ impl Shape {
     /// Length of x without the constant 1: the cell's one-hot code, then the numbers.
     pub fn inputs(&self) -> usize {
         self.columns.cells + self.columns.numbers
+    }
+
+    /// Of them, those that the actor does not see.
+    pub fn critic_only(&self) -> std::ops::Range<usize> {
+        self.inputs() - self.columns.critic_only..self.inputs()
     }
 
     /// Length of a sample's numbers with the constant 1.
@@ -146,6 +153,7 @@ impl Network {
                 }
             }
         }
+        unseen_by_actor(shape, &mut parameters);
         let actor = orthogonal(shape.outputs, hidden, 0.01, random);
         let critic = orthogonal(1, hidden, 1.0, random);
         for unit in 0..hidden {
@@ -249,7 +257,7 @@ impl Network {
 
     /// Outputs and gradient in one: evaluates y on a batch of inputs as in [`Network::act`], lets
     /// `loss` turn it into dL/dy block by block, and writes dL/d parameters, except for those of the
-    /// constants c, which stay zero.
+    /// constants c and of what the actor does not see, which are zero.
     pub fn differentiate(
         &mut self,
         inputs: Rows<'_>,
@@ -265,6 +273,15 @@ impl Network {
             #[cfg(feature = "torch")]
             Engine::Torch(tensors) => tensors.differentiate(parameters, inputs, gradient, loss),
         }
+        unseen_by_actor(shape, gradient);
+    }
+}
+
+/// Sets the entries of W to 0 that would show the actor what only the critic sees.
+fn unseen_by_actor(shape: Shape, parameters: &mut [f32]) {
+    for input in shape.critic_only() {
+        let at = shape.first_at(0, input);
+        parameters[at..at + shape.hidden].fill(0.0);
     }
 }
 

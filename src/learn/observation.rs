@@ -6,6 +6,11 @@
 //! the time if it is time-aware. In the game `joint` its half before the draw sees what the protagonist sees,
 //! its budget and the time likewise. Every row ends with the constant 1 of the networks' biases.
 //!
+//! The protagonist's critic plays no part but in training, and may then see all that its value depends on
+//! ([`CriticSees::Game`], an asymmetric actor-critic: Pinto and others 2018): the remaining budget and the time.
+//! A critic that sees neither takes a state that is reached late, or after the antagonist has spent its budget,
+//! for the same state early, and makes waiting look like progress.
+//!
 //! As coordinates ([`View::Coordinates`], the paper's) these are a few numbers, in which a small network
 //! cannot turn sharply from one place to the next. As features ([`View::Features`]) they are
 //!
@@ -22,11 +27,12 @@
 use super::head::HeadOf;
 use super::inputs::{Columns, Inputs};
 use super::method::Arena;
-use super::options::{TrainOptions, View};
+use super::options::{CriticSees, TrainOptions, View};
 use super::policy::{DrawSituation, Situation};
-use crate::game::budget::Eta;
+use crate::game::budget::{Budget, Eta};
 use lava_envs::{Action, World};
 use std::f32::consts::FRAC_PI_2;
+use std::ops::Range;
 
 /// Octaves of the Fourier basis.
 const OCTAVES: usize = 3;
@@ -43,14 +49,18 @@ pub struct Observation {
     actions: usize,
     protagonist_time: bool,
     antagonist_time: bool,
-    /// 1 / log eta, or 0 where the budget is hidden.
+    /// Whether the protagonist's critic sees the time and the budget.
+    critic_sees_game: bool,
+    /// 1 / log eta, or 0 at eta = 1.
     budget_scale: f64,
+    /// The same for the antagonist, or 0 where the budget is hidden from it.
+    antagonist_budget_scale: f64,
 }
 
 impl Observation {
     /// What the players of a game with these options see of a world.
     pub fn new<W: World>(world: &W, options: &TrainOptions, eta: Eta) -> Self {
-        let blind = options.hide_budget || eta.is_neutral();
+        let budget_scale = if eta.is_neutral() { 0.0 } else { 1.0 / eta.get().ln() };
         let finite = match options.observation {
             View::Coordinates => None,
             View::Features => world.finite(),
@@ -61,7 +71,9 @@ impl Observation {
             actions: finite.map_or(0, |of| of.actions()),
             protagonist_time: options.protagonist.time_aware,
             antagonist_time: options.antagonist.time_aware,
-            budget_scale: if blind { 0.0 } else { 1.0 / eta.get().ln() },
+            critic_sees_game: options.critic_sees == CriticSees::Game,
+            budget_scale,
+            antagonist_budget_scale: if options.hide_budget { 0.0 } else { budget_scale },
         }
     }
 
@@ -77,30 +89,67 @@ impl Observation {
 
     /// Sizes of what the protagonist sees.
     pub fn protagonist_columns<W: World>(&self) -> Columns {
-        let numbers = self.place_columns::<W>(W::OBSERVATION);
-        Columns { cells: self.states, numbers: numbers + self.time_columns(self.protagonist_time) }
+        let place = self.place_columns::<W>(W::OBSERVATION);
+        let critic_only = self.critic_columns();
+        let numbers = place + self.time_columns(self.protagonist_time) + critic_only;
+        Columns { cells: self.states, numbers, critic_only }
+    }
+
+    /// Numbers that only the protagonist's critic sees: the budget, and the time unless the protagonist sees
+    /// it as well.
+    fn critic_columns(&self) -> usize {
+        let game = self.critic_sees_game;
+        usize::from(game) + self.time_columns(game && !self.protagonist_time)
     }
 
     /// Sizes of what the antagonist sees.
     pub fn antagonist_columns<W: World>(&self) -> Columns {
         let numbers = self.place_columns::<W>(W::SITUATION) + 1;
         let cells = self.states * self.actions;
-        Columns { cells, numbers: numbers + self.time_columns(self.antagonist_time) }
+        let numbers = numbers + self.time_columns(self.antagonist_time);
+        Columns { cells, numbers, critic_only: 0 }
     }
 
     /// Sizes of what the antagonist of the protagonist's draw sees.
     pub fn draw_columns<W: World>(&self) -> Columns {
         let numbers = self.place_columns::<W>(W::OBSERVATION) + 1;
-        Columns { cells: self.states, numbers: numbers + self.time_columns(self.antagonist_time) }
+        let numbers = numbers + self.time_columns(self.antagonist_time);
+        Columns { cells: self.states, numbers, critic_only: 0 }
     }
 
-    /// Writes what the protagonist sees in every slot.
+    /// Writes what the protagonist sees in every slot. Where its critic sees the budget, that is 1 until
+    /// [`Observation::show_budgets`].
     pub fn protagonist<W: World>(&self, world: &W, inputs: &mut Inputs) {
         let place = self.place_columns::<W>(W::OBSERVATION);
         let width = self.protagonist_columns::<W>().numbers + 1;
         self.show_states(world, width, inputs);
         for (slot, row) in inputs.numbers.chunks_exact_mut(width).enumerate() {
-            close(world, slot, &mut row[place..]);
+            let rest = &mut row[place..];
+            let (time, budget) = self.time_and_budget(rest.len() - 1);
+            rest[budget].fill(0.0);
+            show_time(world, slot, &mut rest[time]);
+            row[width - 1] = 1.0;
+        }
+    }
+
+    /// Shows the budgets to the protagonist's critic, in rows with a slot each.
+    pub fn show_budgets<W: World>(&self, budgets: &[Budget], rows: &mut [f32]) {
+        let place = self.place_columns::<W>(W::OBSERVATION);
+        let width = self.protagonist_columns::<W>().numbers + 1;
+        for (row, budget) in rows.chunks_exact_mut(width).zip(budgets) {
+            let (_, at) = self.time_and_budget(width - 1 - place);
+            row[place..][at].fill((budget.get().ln() * self.budget_scale) as f32);
+        }
+    }
+
+    /// Where time and budget are among so many numbers of the protagonist that follow those of the place:
+    /// what the critic alone sees comes last.
+    fn time_and_budget(&self, numbers: usize) -> (Range<usize>, Range<usize>) {
+        let budget = usize::from(self.critic_sees_game);
+        if self.protagonist_time {
+            (0..numbers - budget, numbers - budget..numbers)
+        } else {
+            (budget..numbers, 0..budget)
         }
     }
 
@@ -110,7 +159,7 @@ impl Observation {
         let width = self.draw_columns::<W>().numbers + 1;
         self.show_states(of.world, width, inputs);
         for (slot, row) in inputs.numbers.chunks_exact_mut(width).enumerate() {
-            row[place] = (of.budgets[slot].get().ln() * self.budget_scale) as f32;
+            row[place] = (of.budgets[slot].get().ln() * self.antagonist_budget_scale) as f32;
             close(of.world, slot, &mut row[place + 1..]);
         }
     }
@@ -147,7 +196,7 @@ impl Observation {
                 of.world.situation(slot, action, situation);
                 fourier(situation, waves);
             }
-            row[place] = (of.budgets[slot].get().ln() * self.budget_scale) as f32;
+            row[place] = (of.budgets[slot].get().ln() * self.antagonist_budget_scale) as f32;
             close(of.world, slot, &mut row[place + 1..]);
         }
     }
@@ -157,7 +206,7 @@ impl Observation {
     pub fn with_more_budget<W: World>(&self, inputs: &mut Inputs, log_factor: f64) {
         let place = self.place_columns::<W>(W::SITUATION);
         for row in inputs.numbers.chunks_exact_mut(self.antagonist_columns::<W>().numbers + 1) {
-            row[place] += (log_factor * self.budget_scale) as f32;
+            row[place] += (log_factor * self.antagonist_budget_scale) as f32;
         }
     }
 
@@ -165,7 +214,7 @@ impl Observation {
     pub fn with_more_budget_at_draw<W: World>(&self, inputs: &mut Inputs, log_factor: f64) {
         let place = self.place_columns::<W>(W::OBSERVATION);
         for row in inputs.numbers.chunks_exact_mut(self.draw_columns::<W>().numbers + 1) {
-            row[place] += (log_factor * self.budget_scale) as f32;
+            row[place] += (log_factor * self.antagonist_budget_scale) as f32;
         }
     }
 
@@ -188,12 +237,16 @@ impl Observation {
     }
 }
 
-/// Writes the time, where there is room for it, its waves, where there is room for them, and the
-/// constant 1.
+/// Writes the time and the constant 1.
 fn close<W: World>(world: &W, slot: usize, rest: &mut [f32]) {
     let (one, time) = rest.split_last_mut().expect("there is room for the constant 1");
     *one = 1.0;
-    if let Some((time, waves)) = time.split_first_mut() {
+    show_time(world, slot, time);
+}
+
+/// Writes the time, where there is room for it, and its waves, where there is room for them.
+fn show_time<W: World>(world: &W, slot: usize, room: &mut [f32]) {
+    if let Some((time, waves)) = room.split_first_mut() {
         *time = 2.0 * world.time(slot) as f32 / world.horizon() as f32 - 1.0;
         fourier(&[*time], waves);
     }

@@ -42,6 +42,8 @@ pub struct TrainOptions {
     pub adversary: Adversary,
     /// What the antagonist reweights.
     pub antagonist_acts: Acts,
+    /// What the protagonist's critic sees.
+    pub critic_sees: CriticSees,
     /// Hides the remaining budget from the antagonist (an ablation).
     pub hide_budget: bool,
     /// Whether the antagonist's gradient counts what it spends (see [`super::budget_sensitivity`]).
@@ -141,6 +143,16 @@ pub enum View {
     Features,
 }
 
+/// What the protagonist's critic sees (see [`super::observation`]).
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum CriticSees {
+    /// What the protagonist sees.
+    Observation,
+    /// The time and the antagonist's remaining budget as well.
+    Game,
+}
+
 /// The protagonist's law of pushes in the plane (see [`super::plane`]).
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
@@ -202,17 +214,16 @@ pub struct PlayerOptions {
     pub gradient_norm: f64,
 }
 
-/// The antagonist's family of perturbations. The bounds of the bumps exp(-1/2 (xi-c)' K (xi-c)) keep
-/// log M finite.
+/// The antagonist's family of perturbations. The bounds keep log M finite.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct FamilyOptions {
     /// Name of the family; `auto` is the default one of the world's law of chance.
     pub kind: String,
-    /// bumps: number of bumps whose weighted sum the likelihood ratio is.
+    /// bumps, probits: number of components whose weighted sum the likelihood ratio is.
     pub count: usize,
-    /// bumps: bound of |c|, in standard deviations of the noise.
+    /// bumps: bound of |c|, in standard deviations of the noise. probits: bound of |a|.
     pub center: f64,
-    /// bumps: bound of the eigenvalues of K.
+    /// bumps: bound of the eigenvalues of K. probits: bound of |w|^2.
     pub curvature: f64,
 }

@@ -2,6 +2,7 @@
 
 use super::family::Played;
 use super::method::{Arena, Setting};
+use super::observation::Observation;
 use super::options::{Credit, TrainOptions};
 use super::pair::{LearnedOpponent, Pair, PpoPolicy};
 use super::policy::{Draw, Mode, Noise, Nominal, Opponent, Streams};
@@ -105,7 +106,7 @@ impl<W: Arena> Collector<W> {
                 None => &mut Nominal,
             };
             self.game.step(&mut policy, terms.mode, chance, Draw::Perturbed);
-            self.record_protagonist(&mut policy, options.credit);
+            self.record_protagonist(&mut policy, pair.observation, options.credit);
             if let Some(opponent) = &opponent {
                 self.record_antagonist(opponent);
                 self.record_draws(opponent);
@@ -121,7 +122,7 @@ impl<W: Arena> Collector<W> {
             None => &mut Nominal,
         };
         self.game.choose(&mut policy, terms.mode, chance, Draw::Perturbed);
-        self.protagonist.inputs.extend(policy.inputs.rows());
+        self.record_view(&policy, pair.observation);
         if let Some(opponent) = &mut opponent {
             opponent.look(&self.game.situation());
             self.antagonist.inputs.extend(opponent.inputs.rows());
@@ -145,10 +146,11 @@ impl<W: Arena> Collector<W> {
     fn record_protagonist(
         &mut self,
         policy: &mut PpoPolicy<'_, super::pair::HeadIn<W>>,
+        observation: Observation,
         credit: Credit,
     ) {
+        self.record_view(policy, observation);
         let (game, record) = (&self.game, &mut self.protagonist);
-        record.inputs.extend(policy.inputs.rows());
         for slot in 0..game.slots() {
             let choice = match credit {
                 Credit::Chosen => None,
@@ -161,6 +163,18 @@ impl<W: Arena> Collector<W> {
             record.rewards.push(game.steps[slot].reward as f32);
             record.ended.push(game.steps[slot].end.is_some());
         }
+    }
+
+    /// Records what the protagonist saw, and its critic besides.
+    fn record_view(
+        &mut self,
+        policy: &PpoPolicy<'_, super::pair::HeadIn<W>>,
+        observation: Observation,
+    ) {
+        let inputs = &mut self.protagonist.inputs;
+        let start = inputs.numbers.len();
+        inputs.extend(policy.inputs.rows());
+        observation.show_budgets::<W>(&self.game.budgets_at_draw, &mut inputs.numbers[start..]);
     }
 
     fn record_antagonist(&mut self, opponent: &LearnedOpponent<'_, W>) {

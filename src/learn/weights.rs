@@ -144,15 +144,17 @@ impl Place {
 /// All tensors of a player, out of the flat layout of [`crate::learn::network`].
 fn layout(player: &str, shape: Shape) -> Vec<(String, Place)> {
     let Shape { hidden, outputs, constants, .. } = shape;
-    let inputs = shape.inputs();
     let mut places = Vec::new();
     let mut add = |name: &str, shape: Vec<usize>, start, strides| {
         places.push((format!("{player}.{name}"), Place { shape, start, strides }));
     };
     let wide = 2 * hidden;
-    for (net, unit, row, rows) in [("actor", 0, 0, outputs), ("critic", hidden, outputs, 1)] {
+    let (actor_inputs, inputs) = (shape.critic_only().start, shape.inputs());
+    for (net, seen, unit, row, rows) in
+        [("actor", actor_inputs, 0, 0, outputs), ("critic", inputs, hidden, outputs, 1)]
+    {
         let first = shape.first_at(unit, 0);
-        add(&format!("{net}.hidden.weight"), vec![hidden, inputs], first, [1, wide]);
+        add(&format!("{net}.hidden.weight"), vec![hidden, seen], first, [1, wide]);
         let bias = shape.first_at(unit, inputs);
         add(&format!("{net}.hidden.bias"), vec![hidden], bias, [1, 0]);
         let second = shape.second_at(row, unit);

@@ -12,12 +12,13 @@ const RENAMED: [(&str, &str); 3] = [
 ];
 
 /// What former versions did not write, by section and key, with the value that it had in them.
-fn added() -> [(&'static str, &'static str, Value); 6] {
+fn added() -> [(&'static str, &'static str, Value); 7] {
     [
         ("train.family", "train.family.kind", "auto".into()),
         ("train", "train.observation", "coordinates".into()),
         ("train", "train.policy", "gaussian".into()),
         ("train", "train.antagonist_acts", "outcome".into()),
+        ("train", "train.critic_sees", "observation".into()),
         ("train", "train.exploring_starts", 0.0.into()),
         ("train", "train.exploring_until", 0.25.into()),
     ]
