@@ -16,6 +16,7 @@ use criterion::{BatchSize, BenchmarkId, Criterion, Throughput, criterion_group, 
 use cvar_game::experiment::config::{Config, Source};
 use cvar_game::experiment::registry::standard;
 use cvar_game::game::budget::{Budget, Eta};
+use cvar_game::game::bump::Bump;
 use cvar_game::game::finite::FiniteFamily;
 use cvar_game::game::gaussian::GaussianFamily;
 use cvar_game::game::perturbation::{Family, Perturbation};
@@ -72,7 +73,7 @@ fn perturbations(criterion: &mut Criterion) {
     let law = grid.law(0, Move::ALL[0]);
     let family = FiniteFamily::<4>::with(&options::<LavaGrid>().family);
     perturbations_of(criterion, "finite", &family, law);
-    let family = GaussianFamily::with(&options::<LavaPoint>().family);
+    let family = GaussianFamily::<Bump>::with(&options::<LavaPoint>().family);
     perturbations_of(criterion, "gaussian", &family, GaussianLaw);
 }
 
