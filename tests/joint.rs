@@ -390,11 +390,12 @@ fn breaks_change_nothing() {
     assert!(error.contains("action-antagonist.actor.hidden.weight"), "{error}");
 }
 
-/// Enough training to settle: the protagonist's updates are small, so that the antagonist keeps up with it.
+/// Enough training to settle. The protagonist's updates are small, so that the antagonist keeps up with it, and
+/// its bonus is large enough that it does not settle on an action for good before that.
 fn patient() -> TrainOptions {
     let mut options = options(Acts::Joint);
     (options.steps, options.parallel_episodes) = (2_000_000, 100);
-    (options.protagonist.entropy, options.protagonist.learning_rate) = (0.01, 0.002);
+    (options.protagonist.entropy, options.protagonist.learning_rate) = (0.05, 0.002);
     options
 }
 
@@ -444,11 +445,11 @@ fn the_value_of_the_game_joint_is_the_cvar_of_the_sampled_policy() {
 }
 
 /// With patience both the greedy and the sampled protagonist come within 0.02 of the optimal CVaR, 0. The
-/// settings were chosen on seeds 1 to 10.
+/// settings were chosen on seeds 1 to 20, and on 101 to 104, of which one failed with a bonus of 0.01.
 #[test]
 #[ignore = "a minute with --release, three without: ten runs of two million steps"]
 fn the_game_joint_ends_at_the_optimal_policy() {
-    for seed in 101..=110 {
+    for seed in 201..=210 {
         let [_, gamble, value] = trained(&patient(), seed);
         println!("seed {seed}: P(a2) {gamble:.3}, CVaR {:.3}, value {value:.3}", -0.05 * gamble);
         assert!(gamble < 0.5, "seed {seed}: greedily it gambles, P(a2) = {gamble}");
