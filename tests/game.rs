@@ -13,11 +13,10 @@ use nalgebra::{Matrix2, Vector2};
 use proptest::prelude::*;
 use rand::SeedableRng;
 use rand::rngs::ChaCha8Rng;
-use std::marker::PhantomData;
 use std::ops::Range;
 
 fn family<C: Component>(count: usize) -> GaussianFamily<C> {
-    GaussianFamily { count, center_bound: 4.0, curvature_bound: 50.0, kind: PhantomData }
+    GaussianFamily::new(count, 4.0, 50.0)
 }
 
 /// A family with its parameters, the logits of its weights included.
@@ -327,12 +326,7 @@ proptest! {
 /// At the largest bounds and with extreme parameters everything stays finite.
 #[test]
 fn extreme_probits_stay_finite() {
-    let family = GaussianFamily::<Probit> {
-        count: 1,
-        center_bound: 100.0,
-        curvature_bound: 1e6,
-        kind: PhantomData,
-    };
+    let family = GaussianFamily::<Probit>::new(1, 100.0, 1e6);
     for parameters in [[1e6, 0.0, 1e6], [0.0, -1e6, -1e6], [1e-6, 0.0, 1e6], [1e6, 1e6, 0.0]] {
         for eta in [1.0, 1.5, 1e6, 1e290] {
             let perturbation = family.perturbation(&parameters, &GaussianLaw, budget(eta));

@@ -35,7 +35,6 @@ use lava_envs::{
 use nalgebra::Vector2;
 use rand::rngs::ChaCha8Rng;
 use rand::{RngExt, SeedableRng};
-use std::marker::PhantomData;
 use std::sync::LazyLock;
 
 fn player() -> PlayerOptions {
@@ -233,9 +232,7 @@ fn the_loss_gradient_equals_finite_differences_for_every_head() {
 }
 
 fn check_gaussian_gradient<C: Component>(count: usize) {
-    let family =
-        GaussianFamily::<C> { count, center_bound: 4.0, curvature_bound: 50.0, kind: PhantomData };
-    let sum = AntagonistHead(family);
+    let sum = AntagonistHead(GaussianFamily::<C>::new(count, 4.0, 50.0));
     let drawn = samples(&sum, 12, &[], |r| {
         let budget = Budget::start(eta(r.random_range(1.0..30.0)));
         let xi = Vector2::new(r.random_range(-2.0..2.0), r.random_range(-2.0..2.0));

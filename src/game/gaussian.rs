@@ -22,9 +22,9 @@ pub trait Component: Copy + std::fmt::Debug + Send + 'static {
     /// Number of its parameters.
     const PARAMETERS: usize;
 
-    /// The ratio with these parameters (any real numbers) as the component of this index in a sum. `center` bounds how
-    /// far from 0 it raises the odds, in standard deviations, `curvature` how steep it is, per squared
-    /// standard deviation.
+    /// The ratio with these parameters (any real numbers) as the component of this index in a sum. `center`
+    /// bounds how far from 0 it raises the odds, in standard deviations, `curvature` how steep it is, per
+    /// squared standard deviation.
     fn new(parameters: &[f64], index: usize, center: f64, curvature: f64) -> Self;
 
     /// log M_j, with M_j = sup delta^0_j.
@@ -68,8 +68,14 @@ pub struct GaussianFamily<C> {
     pub center_bound: f64,
     /// See [`Component::new`].
     pub curvature_bound: f64,
-    /// The kind of the components.
-    pub kind: PhantomData<C>,
+    kind: PhantomData<C>,
+}
+
+impl<C> GaussianFamily<C> {
+    /// The family of sums of so many components with these bounds.
+    pub fn new(count: usize, center_bound: f64, curvature_bound: f64) -> Self {
+        GaussianFamily { count, center_bound, curvature_bound, kind: PhantomData }
+    }
 }
 
 /// An admissible perturbation of the standard normal law.

@@ -4,6 +4,7 @@ pub mod budget;
 pub mod bump;
 pub mod finite;
 pub mod gaussian;
+pub mod normal;
 pub mod perturbation;
 pub mod probit;
 pub mod returns;

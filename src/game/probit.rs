@@ -16,11 +16,10 @@
 //!   mean T w/s and covariance I - w w'/s^2 (an extended skew-normal law, Azzalini 1985).
 
 use super::gaussian::{Component, Gradient, MOST};
+use super::normal::{below, density, quantile};
 use super::squashed::Squashed;
 use nalgebra::{Vector1, Vector2};
 use rand::{Rng, RngExt};
-use statrs::function::erf::{erfc, erfc_inv};
-use std::f64::consts::{PI, SQRT_2};
 
 /// What zero parameters mean for each step's a, before squashing: as likely as not first, then rarer.
 const NEUTRAL: [f64; MOST] = [0.0, 0.25, 0.5];
@@ -82,7 +81,7 @@ impl Component for Probit {
     fn draw<R: Rng>(&self, z: Vector2<f64>, random: &mut R) -> Vector2<f64> {
         // T > a: with u uniform in (0, 1], Phi(-T) = u Phi(-a).
         let beyond = (1.0 - random.random::<f64>()) * self.mass;
-        let t = SQRT_2 * erfc_inv(2.0 * beyond);
+        let t = -quantile(beyond);
         // z with its part along w shrunk by 1/s has the covariance I - w w'/s^2.
         let (w, s) = (self.slope.value, self.scale);
         let shrink = w.dot(&z) / (s * (s + 1.0));
@@ -112,12 +111,7 @@ impl Component for Probit {
     }
 }
 
-/// Phi.
-fn below(x: f64) -> f64 {
-    0.5 * erfc(-x / SQRT_2)
-}
-
 /// d log Phi(x) / dx = phi(x) / Phi(x).
 fn mills(x: f64) -> f64 {
-    if x < -30.0 { -x } else { (-0.5 * x * x).exp() / ((2.0 * PI).sqrt() * below(x)) }
+    if x < -30.0 { -x } else { density(x) / below(x) }
 }

@@ -27,7 +27,6 @@ use lava_envs::{FiniteLaw, GaussianLaw, Law};
 use rand::RngExt;
 use rand_distr::StandardNormal;
 use std::fmt::Debug;
-use std::marker::PhantomData;
 
 /// What an antagonist records: the nominal law and the budget it acted within, and the outcome.
 pub type Played<L> = Trajectories<(L, Budget), <L as Law>::Outcome>;
@@ -104,8 +103,7 @@ impl Named for GaussianFamily<Probit> {
 }
 
 fn gaussian<C>(options: &FamilyOptions) -> GaussianFamily<C> {
-    let &FamilyOptions { count, center: center_bound, curvature: curvature_bound, .. } = options;
-    GaussianFamily { count, center_bound, curvature_bound, kind: PhantomData }
+    GaussianFamily::new(options.count, options.center, options.curvature)
 }
 
 impl<L: Law> FamilyEntry<L> {

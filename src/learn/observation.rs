@@ -205,15 +205,17 @@ impl Observation {
     /// budget.
     pub fn with_more_budget<W: World>(&self, inputs: &mut Inputs, log_factor: f64) {
         let place = self.place_columns::<W>(W::SITUATION);
-        for row in inputs.numbers.chunks_exact_mut(self.antagonist_columns::<W>().numbers + 1) {
-            row[place] += (log_factor * self.antagonist_budget_scale) as f32;
-        }
+        self.add_budget(inputs, self.antagonist_columns::<W>(), place, log_factor);
     }
 
     /// The same for rows of the antagonist of the protagonist's draw.
     pub fn with_more_budget_at_draw<W: World>(&self, inputs: &mut Inputs, log_factor: f64) {
         let place = self.place_columns::<W>(W::OBSERVATION);
-        for row in inputs.numbers.chunks_exact_mut(self.draw_columns::<W>().numbers + 1) {
+        self.add_budget(inputs, self.draw_columns::<W>(), place, log_factor);
+    }
+
+    fn add_budget(&self, inputs: &mut Inputs, columns: Columns, place: usize, log_factor: f64) {
+        for row in inputs.numbers.chunks_exact_mut(columns.numbers + 1) {
             row[place] += (log_factor * self.antagonist_budget_scale) as f32;
         }
     }

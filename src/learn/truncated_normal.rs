@@ -11,8 +11,8 @@
 //!
 //! The entropy is at most log 2, that of the uniform law, which it tends to as s grows.
 
-use statrs::function::erf::{erfc, erfc_inv};
-use std::f64::consts::{PI, SQRT_2};
+use crate::game::normal::{below, density, quantile};
+use std::f64::consts::PI;
 
 /// N(m, s^2) restricted to [-1, 1], with accurate tails for |m| up to about 38 s + 1.
 #[derive(Debug, Clone, Copy)]
@@ -56,7 +56,7 @@ impl TruncatedNormal {
     pub fn quantile(&self, u: f64) -> f64 {
         let u = if self.sign > 0.0 { u } else { 1.0 - u };
         let share = below(self.a) + u * self.mass;
-        let z = (-SQRT_2 * erfc_inv(2.0 * share)).clamp(self.a, self.b);
+        let z = quantile(share).clamp(self.a, self.b);
         (self.mean + self.sign * self.std * z).clamp(-1.0, 1.0)
     }
 
@@ -97,16 +97,6 @@ impl TruncatedNormal {
     fn log_normaliser(&self) -> f64 {
         0.5 * (2.0 * PI).ln() + self.std.ln() + self.mass.ln()
     }
-}
-
-/// Phi, accurate in the lower tail.
-fn below(z: f64) -> f64 {
-    0.5 * erfc(-z / SQRT_2)
-}
-
-/// phi.
-fn density(z: f64) -> f64 {
-    (-0.5 * z * z).exp() / (2.0 * PI).sqrt()
 }
 
 #[cfg(test)]
