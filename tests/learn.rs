@@ -3,12 +3,15 @@
 
 use cvar_game::game::budget::{Budget, Eta};
 use cvar_game::game::bump::Bump;
+use cvar_game::game::columns::SAMPLES;
 use cvar_game::game::finite::FiniteFamily;
 use cvar_game::game::gaussian::{Component, GaussianFamily, MOST};
 use cvar_game::game::probit::Probit;
 use cvar_game::learn::adam::Adam;
 use cvar_game::learn::device::Device;
-use cvar_game::learn::head::{AntagonistHead, CategoricalPolicy, GaussianPolicy, Head, PolicyHead};
+use cvar_game::learn::head::{
+    AntagonistHead, Block, CategoricalPolicy, GaussianPolicy, Head, PolicyHead,
+};
 use cvar_game::learn::inputs::{Columns, Inputs};
 use cvar_game::learn::method::{Arena, Players, Progress, Setting, TrainError, Training};
 use cvar_game::learn::methods::game::{GameTraining, schedule};
@@ -125,8 +128,50 @@ fn played<W: Arena>(world: W, pair: &Pair<W>, draw: Option<Draw>, setting: &Play
     play(world, protagonist.as_mut(), opponent.as_mut(), &setting, &mut ())
 }
 
+/// What a head computes in columns against its formulas for one sample.
+fn check_columns<H: Head>(head: &H, samples: &[Sample<H>], constants: &[f32], seed: u64) {
+    let mut random = ChaCha8Rng::seed_from_u64(seed);
+    let count = head.outputs() + constants.len();
+    let mut parameters = vec![[0.0; SAMPLES]; count];
+    for (k, column) in parameters.iter_mut().enumerate() {
+        match k.checked_sub(head.outputs()) {
+            Some(at) => column.fill(f64::from(constants[at])),
+            None => column.fill_with(|| random.random_range(-3.0..3.0)),
+        }
+    }
+    let given: Vec<H::Given> = samples.iter().map(|sample| sample.given).collect();
+    let choices: Vec<H::Choice> = samples.iter().map(|sample| sample.choice).collect();
+    let (mut log_probability, mut entropy) = ([0.0; SAMPLES], [0.0; SAMPLES]);
+    let [mut score, mut entropy_gradient] = [(); 2].map(|()| vec![[0.0; SAMPLES]; count]);
+    head.gradients_of_block(Block {
+        parameters: &parameters,
+        given: &given,
+        choices: &choices,
+        log_probability: &mut log_probability,
+        entropy: &mut entropy,
+        score: &mut score,
+        entropy_gradient: &mut entropy_gradient,
+    });
+    let close = |ours: f64, reference: f64, what: &str| {
+        let off = (ours - reference).abs();
+        assert!(off < 1e-9 * (1.0 + reference.abs()), "{head:?}, {what}: {ours}, {reference}");
+    };
+    for (i, (given, choice)) in given.iter().zip(&choices).enumerate() {
+        let own: Vec<f64> = parameters.iter().map(|column| column[i]).collect();
+        let [mut by_choice, mut by_entropy] = [(); 2].map(|()| vec![0.0; count]);
+        let (log, nats) = head.gradients(&own, given, choice, &mut by_choice, &mut by_entropy);
+        close(log_probability[i], log, "log-probability");
+        close(entropy[i], nats, "entropy");
+        for k in 0..count {
+            close(score[k][i], by_choice[k], "score");
+            close(entropy_gradient[k][i], by_entropy[k], "gradient of the entropy");
+        }
+    }
+}
+
 /// The loss's gradient by y and by the constants against finite differences.
 fn check_loss_gradient<H: Head>(head: &H, samples: &[Sample<H>], constants: &[f32], seed: u64) {
+    check_columns(head, samples, constants, seed);
     let options = player();
     let rows = head.outputs() + 1;
     let mut random = ChaCha8Rng::seed_from_u64(seed);
@@ -224,6 +269,12 @@ fn the_loss_gradient_equals_finite_differences_for_every_head() {
         ((law, budget), r.random_range(0..4usize))
     });
     check_loss_gradient(&finite, &drawn, &[], 3);
+    // With an outcome that cannot happen and as many samples as a block has.
+    let drawn = samples(&finite, SAMPLES, &[], |r| {
+        let law = FiniteLaw { probabilities: [0.0, 0.3, 0.3, 0.4] };
+        ((law, Budget::start(eta(r.random_range(1.0..4.0)))), r.random_range(1..4usize))
+    });
+    check_columns(&finite, &drawn, &[], 6);
 
     for count in 1..=MOST {
         check_gaussian_gradient::<Bump>(count);

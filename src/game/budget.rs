@@ -5,6 +5,7 @@
 //! `sup_o delta_t(o) <= eta_t`. Then eta_t never falls below 1, and it may rise above eta when a
 //! ratio below 1 is realised.
 
+use crate::game::columns::exp_m1;
 use serde::{Deserialize, Serialize};
 
 /// The budget eta >= 1 of a game. The protagonist's risk level is alpha = 1/eta.
@@ -123,14 +124,7 @@ impl Budget {
     /// `sup delta = min(M, eta_t)`. The quotient stays accurate when M is huge; log M must stay below
     /// 700, which the families' bounds see to.
     pub fn mix(self, log_supremum: f64) -> Mixing {
-        let room = self.0 - 1.0;
-        let excess = log_supremum.exp_m1(); // M - 1, accurate near M = 1
-        if excess <= room {
-            Mixing { weight: 1.0, by_log_supremum: 0.0 }
-        } else {
-            let weight = room / excess;
-            Mixing { weight, by_log_supremum: -weight * (1.0 + 1.0 / excess) }
-        }
+        Mixing::within(self.0, exp_m1(log_supremum))
     }
 }
 
@@ -144,7 +138,18 @@ pub struct Mixing {
 }
 
 impl Mixing {
+    /// The mixing within a budget, from M - 1.
+    #[inline(always)]
+    pub fn within(budget: f64, excess: f64) -> Mixing {
+        let room = budget - 1.0;
+        let free = excess <= room;
+        let weight = if free { 1.0 } else { room / excess };
+        let by_log_supremum = if free { 0.0 } else { -weight * (1.0 + 1.0 / excess) };
+        Mixing { weight, by_log_supremum }
+    }
+
     /// delta(o), from delta^0(o).
+    #[inline(always)]
     pub fn likelihood_ratio(&self, base: f64) -> f64 {
         let ratio = (1.0 - self.weight) + self.weight * base;
         // Positive in truth, though delta^0 far from its bump rounds to 0.
@@ -153,6 +158,7 @@ impl Mixing {
 
     /// Derivatives of delta(o) by log delta^0(o) and by log M, gradients flowing through lambda:
     /// d delta = rho delta^0 dlog delta^0 + (delta^0 - 1) d rho.
+    #[inline(always)]
     pub fn derivatives(&self, base: f64) -> (f64, f64) {
         (self.weight * base, (base - 1.0) * self.by_log_supremum)
     }

@@ -16,9 +16,10 @@
 //! | S | `covariance` |
 //! | m | `mean` |
 
+use super::columns::{exp, ln};
 use super::gaussian::{Component, Gradient, MOST};
 use super::squashed::Squashed;
-use nalgebra::{Matrix2, SVector, Vector2};
+use nalgebra::{Matrix2, Vector2};
 use rand::Rng;
 
 /// What zero parameters mean on the diagonal of each bump's L, before squashing: K = L L' has no gradient at
@@ -31,43 +32,77 @@ pub struct Bump {
     center: Squashed<2>,
     /// Entries (L11, L21, L22) of the Cholesky factor.
     factor: Squashed<3>,
-    curvature: Matrix2<f64>,
-    covariance: Matrix2<f64>,
+    curvature: Symmetric,
+    covariance: Symmetric,
+    /// log|I+K|.
+    log_determinant: f64,
     log_supremum: f64,
+}
+
+/// A symmetric matrix, by its entries. Every formula is written out, so that it can be one of columns
+/// ([`super::columns`]).
+#[derive(Debug, Clone, Copy)]
+struct Symmetric {
+    xx: f64,
+    xy: f64,
+    yy: f64,
+}
+
+impl Symmetric {
+    #[inline(always)]
+    fn times(&self, [x, y]: [f64; 2]) -> [f64; 2] {
+        [self.xx * x + self.xy * y, self.xy * x + self.yy * y]
+    }
+
+    /// v' A v.
+    #[inline(always)]
+    fn form(&self, [x, y]: [f64; 2]) -> f64 {
+        self.xx * x * x + 2.0 * self.xy * x * y + self.yy * y * y
+    }
+
+    fn matrix(&self) -> Matrix2<f64> {
+        Matrix2::new(self.xx, self.xy, self.xy, self.yy)
+    }
 }
 
 impl Bump {
     /// The centre c.
     pub fn center(&self) -> Vector2<f64> {
-        self.center.value
+        self.center.value.into()
     }
 
     /// The curvature K.
     pub fn curvature(&self) -> Matrix2<f64> {
-        self.curvature
+        self.curvature.matrix()
     }
 
     /// The mean m = S K c of the reweighted law.
     pub fn mean(&self) -> Vector2<f64> {
-        self.covariance * (self.curvature * self.center.value)
+        self.covariance.times(self.curvature.times(self.center.value)).into()
     }
 
     /// The covariance S of the reweighted law.
     pub fn covariance(&self) -> Matrix2<f64> {
-        self.covariance
+        self.covariance.matrix()
     }
 
     /// log of the integral of P exp(-1/2 (xi-c)' K (xi-c)) over the plane, log Z, evaluated with a
     /// decomposition of K of its own.
     pub fn log_integral(&self) -> f64 {
-        let eigen = self.curvature.symmetric_eigen();
-        let along = eigen.eigenvectors.transpose() * self.center.value;
+        let eigen = self.curvature().symmetric_eigen();
+        let along = eigen.eigenvectors.transpose() * self.center();
         (0..2)
             .map(|i| {
                 let k = eigen.eigenvalues[i];
                 -0.5 * k.ln_1p() - 0.5 * along[i] * along[i] * k / (1.0 + k)
             })
             .sum()
+    }
+
+    /// xi - c.
+    #[inline(always)]
+    fn off(&self, xi: Vector2<f64>) -> [f64; 2] {
+        [xi.x - self.center.value[0], xi.y - self.center.value[1]]
     }
 }
 
@@ -76,31 +111,38 @@ impl Component for Bump {
     /// factors L with `||K|| <= ||L||_F^2 < curvature`.
     const PARAMETERS: usize = 5;
 
+    #[inline(always)]
     fn new(parameters: &[f64], index: usize, center: f64, curvature: f64) -> Self {
-        let [x, y, a, b, d] = std::array::from_fn(|i| parameters[i]);
         let neutral = NEUTRAL_DIAGONAL[index];
-        let center = Squashed::new(Vector2::new(x, y), center);
-        let raw = SVector::<f64, 3>::new(neutral + a, b, neutral + d);
+        let center = Squashed::new([parameters[0], parameters[1]], center);
+        let raw = [neutral + parameters[2], parameters[3], neutral + parameters[4]];
         let factor = Squashed::new(raw, curvature.sqrt());
-        let lower = lower_triangle(&factor.value);
-        let curvature = lower * lower.transpose();
+        let [a, b, d] = factor.value;
+        let k = Symmetric { xx: a * a, xy: a * b, yy: b * b + d * d };
         // The inverse of I + K in closed form; its determinant is at least 1.
-        let (k11, k12, k22) = (curvature.m11, curvature.m12, curvature.m22);
-        let determinant = (1.0 + k11) * (1.0 + k22) - k12 * k12;
-        let covariance = Matrix2::new(1.0 + k22, -k12, -k12, 1.0 + k11) / determinant;
+        let determinant = (1.0 + k.xx) * (1.0 + k.yy) - k.xy * k.xy;
+        let inverse = 1.0 / determinant;
+        let covariance = Symmetric {
+            xx: (1.0 + k.yy) * inverse,
+            xy: -k.xy * inverse,
+            yy: (1.0 + k.xx) * inverse,
+        };
+        let log_determinant = ln(determinant);
         let c = center.value;
-        let log_supremum = 0.5 * determinant.ln() + 0.5 * c.dot(&(curvature * (covariance * c)));
-        Bump { center, factor, curvature, covariance, log_supremum }
+        let pulled = k.times(covariance.times(c));
+        let log_supremum = 0.5 * (log_determinant + c[0] * pulled[0] + c[1] * pulled[1]);
+        Bump { center, factor, curvature: k, covariance, log_determinant, log_supremum }
     }
 
+    #[inline(always)]
     fn log_supremum(&self) -> f64 {
         self.log_supremum
     }
 
     /// M exp(-1/2 (xi-c)' K (xi-c)).
+    #[inline(always)]
     fn likelihood_ratio(&self, xi: Vector2<f64>) -> f64 {
-        let off = xi - self.center.value;
-        (self.log_supremum - 0.5 * off.dot(&(self.curvature * off))).exp()
+        exp(self.log_supremum - 0.5 * self.curvature.form(self.off(xi)))
     }
 
     /// m + A z with A A' = S.
@@ -109,27 +151,43 @@ impl Component for Bump {
     }
 
     /// 1/2 log|I+K|.
+    #[inline(always)]
     fn lost_entropy(&self) -> f64 {
-        -0.5 * self.covariance.determinant().ln()
+        0.5 * self.log_determinant
     }
 
+    #[inline(always)]
     fn pull_back(&self, xi: Vector2<f64>, by: Gradient, gradient: &mut [f64]) {
         let Gradient { by_ratio, by_supremum, by_lost } = by;
         // By c: K (xi-c) and, of log M, c - S c (as K S = I - S). By K (all four entries free):
         // -1/2 (xi-c)(xi-c)' and, of log M, 1/2 (S + S c c' S); of log|I+K|, S.
-        let (c, s) = (self.center.value, self.covariance);
-        let (off, shrunk) = (xi - c, s * c);
+        let (c, s, off) = (self.center.value, self.covariance, self.off(xi));
+        let shrunk = s.times(c);
         // log delta^0 = log M - 1/2 (xi-c)' K (xi-c), so log M enters both ways.
         let through_supremum = by_ratio + by_supremum;
-        let by_center = (c - shrunk) * through_supremum + self.curvature * off * by_ratio;
-        let by_curvature = (s + shrunk * shrunk.transpose()) * (0.5 * through_supremum)
-            - off * off.transpose() * (0.5 * by_ratio)
-            + s * (0.5 * by_lost);
+        let pulled = self.curvature.times(off);
+        let by_center = [
+            (c[0] - shrunk[0]) * through_supremum + pulled[0] * by_ratio,
+            (c[1] - shrunk[1]) * through_supremum + pulled[1] * by_ratio,
+        ];
+        let by_entry = |s: f64, shrunk: f64, off: f64| {
+            0.5 * ((s + shrunk) * through_supremum - off * by_ratio + s * by_lost)
+        };
+        let by_curvature = Symmetric {
+            xx: by_entry(s.xx, shrunk[0] * shrunk[0], off[0] * off[0]),
+            xy: by_entry(s.xy, shrunk[0] * shrunk[1], off[0] * off[1]),
+            yy: by_entry(s.yy, shrunk[1] * shrunk[1], off[1] * off[1]),
+        };
         // K = L L': dF/dL = 2 (dF/dK) L for a symmetric dF/dK.
-        let by_factor = by_curvature * lower_triangle(&self.factor.value) * 2.0;
-        let by_entries = SVector::<f64, 3>::new(by_factor.m11, by_factor.m21, by_factor.m22);
-        gradient[..2].copy_from_slice(self.center.pull_back(by_center).as_slice());
-        gradient[2..].copy_from_slice(self.factor.pull_back(by_entries).as_slice());
+        let [a, b, d] = self.factor.value;
+        let column = by_curvature.times([a, b]);
+        let by_factor = [2.0 * column[0], 2.0 * column[1], 2.0 * by_curvature.yy * d];
+        let (center, factor) = (self.center.pull_back(by_center), self.factor.pull_back(by_factor));
+        gradient[0] = center[0];
+        gradient[1] = center[1];
+        gradient[2] = factor[0];
+        gradient[3] = factor[1];
+        gradient[4] = factor[2];
     }
 
     /// With a decomposition of K of its own.
@@ -138,13 +196,9 @@ impl Component for Bump {
     }
 }
 
-fn lower_triangle(entries: &SVector<f64, 3>) -> Matrix2<f64> {
-    Matrix2::new(entries[0], 0.0, entries[1], entries[2])
-}
-
 /// The lower triangular A with A A' = S, of a positive definite S.
-fn square_root(covariance: &Matrix2<f64>) -> Matrix2<f64> {
-    let a = covariance.m11.sqrt();
-    let b = covariance.m21 / a;
-    Matrix2::new(a, 0.0, b, (covariance.m22 - b * b).sqrt())
+fn square_root(covariance: &Symmetric) -> Matrix2<f64> {
+    let a = covariance.xx.sqrt();
+    let b = covariance.xy / a;
+    Matrix2::new(a, 0.0, b, (covariance.yy - b * b).sqrt())
 }

@@ -2,7 +2,8 @@
 //! `M = max_i delta^0_i`, followed by identity mixing.
 
 use crate::game::budget::{Budget, Mixing};
-use crate::game::perturbation::{Family, Perturbation};
+use crate::game::columns::{self, Loops, SAMPLES, exp, ln};
+use crate::game::perturbation::{Block, Family, Perturbation};
 use lava_envs::law::{FiniteLaw, sample_index};
 use rand::Rng;
 
@@ -58,6 +59,94 @@ impl<const N: usize> Family for FiniteFamily<N> {
         let ratio = base.map(|base| mixing.likelihood_ratio(base));
         let perturbed = std::array::from_fn(|i| nominal[i] * ratio[i]);
         FinitePerturbation { nominal, base, top, mixing, ratio, perturbed }
+    }
+
+    fn learn(&self, block: Block<'_, FiniteLaw<N>>) {
+        columns::widest(Learn(block));
+    }
+}
+
+/// [`Family::learn`] in columns: the formulas of [`FinitePerturbation`], each in a loop over the samples.
+struct Learn<'a, const N: usize>(Block<'a, FiniteLaw<N>>);
+
+impl<const N: usize> Loops for Learn<'_, N> {
+    #[inline(always)]
+    fn run(self) {
+        let Block { parameters, given, outcomes, log_ratio, entropy, score, entropy_gradient } =
+            self.0;
+        let (score, entropy_gradient) = (&mut score[..N], &mut entropy_gradient[..N]);
+        let mut nominal = [[0.0; SAMPLES]; N];
+        let [mut budget, mut outcome] = [[1.0; SAMPLES]; 2];
+        for (i, ((law, eta), &o)) in given.iter().zip(outcomes).enumerate() {
+            for (column, probability) in nominal.iter_mut().zip(law.probabilities) {
+                column[i] = probability;
+            }
+            (budget[i], outcome[i]) = (eta.get(), o as f64);
+        }
+
+        // The top is the first of the possible outcomes with the largest logit.
+        let (mut highest, mut top) = ([f64::NEG_INFINITY; SAMPLES], [0.0; SAMPLES]);
+        for (k, (logit, nominal)) in parameters.iter().zip(&nominal).enumerate() {
+            for i in 0..SAMPLES {
+                let higher = (nominal[i] > 0.0) & (logit[i] > highest[i]);
+                highest[i] = if higher { logit[i] } else { highest[i] };
+                top[i] = if higher { k as f64 } else { top[i] };
+            }
+        }
+
+        let (mut base, mut sum) = ([[0.0; SAMPLES]; N], [0.0; SAMPLES]);
+        for ((base, logit), nominal) in base.iter_mut().zip(parameters).zip(&nominal) {
+            for i in 0..SAMPLES {
+                base[i] = exp(logit[i] - highest[i]);
+                base[i] = if nominal[i] > 0.0 { base[i] } else { 0.0 };
+                sum[i] += nominal[i] * base[i];
+            }
+        }
+        let [mut rho, mut by_supremum] = [[0.0; SAMPLES]; 2];
+        for i in 0..SAMPLES {
+            // log M = -log sum.
+            let mixing = Mixing::within(budget[i], (1.0 - sum[i]) / sum[i]);
+            (rho[i], by_supremum[i]) = (mixing.weight, mixing.by_log_supremum);
+        }
+
+        // What is passed on by delta^0, and by log M, of log delta(o) and of the entropy.
+        let [mut through, mut lost_through] = [[0.0; SAMPLES]; 2];
+        let [mut at_top, mut lost_at_top] = [[0.0; SAMPLES]; 2];
+        for k in 0..N {
+            let (base, nominal) = (&mut base[k], &nominal[k]);
+            let (score, lost) = (&mut score[k], &mut entropy_gradient[k]);
+            for i in 0..SAMPLES {
+                base[i] = if nominal[i] > 0.0 { base[i] / sum[i] } else { 1.0 };
+                let mixing = Mixing { weight: rho[i], by_log_supremum: by_supremum[i] };
+                let ratio = mixing.likelihood_ratio(base[i]);
+                let (by_base, by_top) = mixing.derivatives(base[i]);
+                let log = ln(ratio);
+                let realised = outcome[i] == k as f64;
+                log_ratio[i] = if realised { log } else { log_ratio[i] };
+                let weight = if realised { 1.0 / ratio } else { 0.0 };
+                score[i] = weight * by_base;
+                through[i] += weight * (by_base + by_top);
+                at_top[i] += weight * by_top;
+                // H = -sum q log q; the constant 1 of its derivative drops out.
+                let possible = nominal[i] > 0.0;
+                let log = if possible { log + ln(nominal[i]) } else { 0.0 };
+                entropy[i] = if k == 0 { 0.0 } else { entropy[i] } - nominal[i] * ratio * log;
+                let weight = -nominal[i] * log;
+                lost[i] = weight * by_base;
+                lost_through[i] += weight * (by_base + by_top);
+                lost_at_top[i] += weight * by_top;
+            }
+        }
+        for k in 0..N {
+            let (base, nominal) = (&base[k], &nominal[k]);
+            let (score, lost) = (&mut score[k], &mut entropy_gradient[k]);
+            for i in 0..SAMPLES {
+                let is_top = if top[i] == k as f64 { 1.0 } else { 0.0 };
+                let q = nominal[i] * base[i];
+                score[i] += is_top * at_top[i] - through[i] * q;
+                lost[i] += is_top * lost_at_top[i] - lost_through[i] * q;
+            }
+        }
     }
 }
 

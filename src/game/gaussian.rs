@@ -7,19 +7,26 @@
 //! lambda, and the laws P delta^0_j, with weights (1 - lambda) w_j.
 
 use crate::game::budget::{Budget, Mixing};
-use crate::game::perturbation::{Family, Perturbation};
+use crate::game::columns::{self, Column, Loops, SAMPLES, exp, ln};
+use crate::game::perturbation::{Block, Family, Perturbation};
 use lava_envs::GaussianLaw;
 use nalgebra::Vector2;
 use rand::{Rng, RngExt};
 use rand_distr::StandardNormal;
 use std::marker::PhantomData;
 
+/// log(2 pi).
+const LOG_2_PI: f64 = 1.837_877_066_409_345_3;
+
+/// The most parameters of a component.
+const MOST_PARAMETERS: usize = 5;
+
 /// The most components of a sum.
 pub const MOST: usize = 3;
 
 /// A normalised likelihood ratio delta^0_j of the standard normal law.
 pub trait Component: Copy + std::fmt::Debug + Send + 'static {
-    /// Number of its parameters.
+    /// Number of its parameters, at most 5.
     const PARAMETERS: usize;
 
     /// The ratio with these parameters (any real numbers) as the component of this index in a sum. `center`
@@ -129,6 +136,147 @@ impl<C: Component> Family for GaussianFamily<C> {
         let mixing = budget.mix(log_supremum);
         GaussianPerturbation { components, weights, count, supremum: log_supremum.exp(), mixing }
     }
+
+    fn learn(&self, block: Block<'_, GaussianLaw>) {
+        columns::widest(Learn { family: self, block });
+    }
+}
+
+/// [`Family::learn`] in columns: the formulas of [`GaussianPerturbation`], each in a loop over the samples.
+struct Learn<'a, C> {
+    family: &'a GaussianFamily<C>,
+    block: Block<'a, GaussianLaw>,
+}
+
+impl<C: Component> Loops for Learn<'_, C> {
+    #[inline(always)]
+    fn run(self) {
+        let Learn { family: &GaussianFamily { count, center_bound, curvature_bound, .. }, block } =
+            self;
+        let Block { parameters, given, outcomes, log_ratio, entropy, score, entropy_gradient } =
+            block;
+        let component = |of: &[Column], i: usize, j: usize| {
+            let own: [f64; MOST_PARAMETERS] =
+                std::array::from_fn(|k| if k < C::PARAMETERS { of[k][i] } else { 0.0 });
+            C::new(&own[..C::PARAMETERS], j, center_bound, curvature_bound)
+        };
+        let own = |j: usize| C::PARAMETERS * j..C::PARAMETERS * (j + 1);
+        let logits = C::PARAMETERS * count;
+
+        let [mut x, mut y, mut budget] = [[0.0; SAMPLES]; 3];
+        for (i, ((_, eta), xi)) in given.iter().zip(outcomes).enumerate() {
+            (x[i], y[i], budget[i]) = (xi.x, xi.y, eta.get());
+        }
+
+        // w = softmax(logits).
+        let mut weights = [[1.0; SAMPLES]; MOST];
+        if count > 1 {
+            let mut highest = parameters[logits];
+            for logit in &parameters[logits + 1..logits + count] {
+                for i in 0..SAMPLES {
+                    highest[i] = if logit[i] > highest[i] { logit[i] } else { highest[i] };
+                }
+            }
+            let mut sum = [0.0; SAMPLES];
+            for (weight, logit) in weights.iter_mut().zip(&parameters[logits..logits + count]) {
+                for i in 0..SAMPLES {
+                    weight[i] = exp(logit[i] - highest[i]);
+                    sum[i] += weight[i];
+                }
+            }
+            for weight in &mut weights[..count] {
+                for i in 0..SAMPLES {
+                    weight[i] /= sum[i];
+                }
+            }
+        }
+
+        // M, delta^0(xi) and the lost entropy, in all and of each component.
+        let [mut supremum, mut base, mut lost] = [[0.0; SAMPLES]; 3];
+        let [mut suprema, mut ratios, mut losts] = [[[0.0; SAMPLES]; MOST]; 3];
+        for j in 0..count {
+            let (of, weight) = (&parameters[own(j)], &weights[j]);
+            let (own_supremum, ratio, own_lost) = (&mut suprema[j], &mut ratios[j], &mut losts[j]);
+            for i in 0..SAMPLES {
+                let component = component(of, i, j);
+                own_supremum[i] = exp(component.log_supremum());
+                ratio[i] = component.likelihood_ratio(Vector2::new(x[i], y[i]));
+                own_lost[i] = component.lost_entropy();
+                supremum[i] += weight[i] * own_supremum[i];
+                base[i] += weight[i] * ratio[i];
+                lost[i] += weight[i] * own_lost[i];
+            }
+        }
+
+        // delta = 1 + rho (delta^0 - 1), and rho depends on log M.
+        let [mut rho, mut by_base, mut by_supremum, mut lost_by_supremum] = [[0.0; SAMPLES]; 4];
+        for i in 0..SAMPLES {
+            let mixing = Mixing::within(budget[i], supremum[i] - 1.0);
+            let ratio = mixing.likelihood_ratio(base[i]);
+            let (_, by) = mixing.derivatives(base[i]);
+            log_ratio[i] = ln(ratio);
+            entropy[i] = 1.0 + LOG_2_PI - mixing.weight * lost[i];
+            rho[i] = mixing.weight;
+            by_base[i] = mixing.weight / ratio;
+            by_supremum[i] = by / (ratio * supremum[i]);
+            lost_by_supremum[i] = -lost[i] * mixing.by_log_supremum / supremum[i];
+        }
+
+        // The gradients by each component's parameters and by log w_j.
+        let [mut by_log, mut lost_by_log] = [[[0.0; SAMPLES]; MOST]; 2];
+        let [mut sum, mut lost_sum] = [[0.0; SAMPLES]; 2];
+        for j in 0..count {
+            let (of, weight) = (&parameters[own(j)], &weights[j]);
+            let (own_supremum, ratio, own_lost) = (&suprema[j], &ratios[j], &losts[j]);
+            let (score, entropy) = (&mut score[own(j)], &mut entropy_gradient[own(j)]);
+            let (by_log, lost_by_log) = (&mut by_log[j], &mut lost_by_log[j]);
+            for i in 0..SAMPLES {
+                let component = component(of, i, j);
+                let share = weight[i] * own_supremum[i];
+                let of_score = Gradient {
+                    by_ratio: by_base[i] * weight[i] * ratio[i],
+                    by_supremum: by_supremum[i] * share,
+                    by_lost: 0.0,
+                };
+                let of_entropy = Gradient {
+                    by_ratio: 0.0,
+                    by_supremum: lost_by_supremum[i] * share,
+                    by_lost: -rho[i] * weight[i],
+                };
+                let mut gradient = [0.0; MOST_PARAMETERS];
+                component.pull_back(
+                    Vector2::new(x[i], y[i]),
+                    of_score,
+                    &mut gradient[..C::PARAMETERS],
+                );
+                for k in 0..C::PARAMETERS {
+                    score[k][i] = gradient[k];
+                }
+                component.pull_back(
+                    Vector2::new(0.0, 0.0),
+                    of_entropy,
+                    &mut gradient[..C::PARAMETERS],
+                );
+                for k in 0..C::PARAMETERS {
+                    entropy[k][i] = gradient[k];
+                }
+                by_log[i] = of_score.by_ratio + of_score.by_supremum;
+                lost_by_log[i] = of_entropy.by_supremum + of_entropy.by_lost * own_lost[i];
+                sum[i] += by_log[i];
+                lost_sum[i] += lost_by_log[i];
+            }
+        }
+        if count > 1 {
+            // dlog w_j / d logit_k = [j = k] - w_k.
+            for j in 0..count {
+                let (score, entropy) = (&mut score[logits + j], &mut entropy_gradient[logits + j]);
+                for i in 0..SAMPLES {
+                    score[i] = by_log[j][i] - weights[j][i] * sum[i];
+                    entropy[i] = lost_by_log[j][i] - weights[j][i] * lost_sum[i];
+                }
+            }
+        }
+    }
 }
 
 impl<C: Component> GaussianPerturbation<C> {
@@ -233,7 +381,7 @@ impl<C: Component> Perturbation for GaussianPerturbation<C> {
             let by_weight = -self.mixing.weight * of.lost_entropy();
             (Gradient { by_ratio: 0.0, by_supremum: by_supremum * share, by_lost }, by_weight)
         });
-        1.0 + (2.0 * std::f64::consts::PI).ln() - self.mixing.weight * lost
+        1.0 + LOG_2_PI - self.mixing.weight * lost
     }
 
     fn normalisation_error(&self) -> f64 {

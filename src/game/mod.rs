@@ -2,6 +2,7 @@
 
 pub mod budget;
 pub mod bump;
+pub mod columns;
 pub mod finite;
 pub mod gaussian;
 pub mod normal;

@@ -7,6 +7,7 @@
 //! 1e-6.
 
 use crate::game::budget::Budget;
+use crate::game::columns::{Column, ln};
 use lava_envs::Law;
 use rand::Rng;
 
@@ -28,6 +29,48 @@ pub trait Family: Clone + std::fmt::Debug {
         law: &Self::Law,
         budget: Budget,
     ) -> Self::Perturbation;
+
+    /// What learning needs of the perturbations of a block of samples. Families override it with columns
+    /// ([`super::columns`]); this is their reference.
+    fn learn(&self, block: Block<'_, Self::Law>) {
+        let Block { parameters, given, outcomes, log_ratio, entropy, score, entropy_gradient } =
+            block;
+        let count = self.parameters();
+        let mut own = vec![0.0; count];
+        let mut gradient = vec![0.0; count];
+        for (i, ((law, budget), &outcome)) in given.iter().zip(outcomes).enumerate() {
+            for (own, column) in own.iter_mut().zip(parameters) {
+                *own = column[i];
+            }
+            let perturbation = self.perturbation(&own, law, *budget);
+            log_ratio[i] = ln(perturbation.score(outcome, &mut gradient));
+            for (column, entry) in score.iter_mut().zip(&gradient) {
+                column[i] = *entry;
+            }
+            entropy[i] = perturbation.entropy(&mut gradient);
+            for (column, entry) in entropy_gradient.iter_mut().zip(&gradient) {
+                column[i] = *entry;
+            }
+        }
+    }
+}
+
+/// What learning needs of the perturbations of at most `SAMPLES` samples.
+pub struct Block<'a, L: Law> {
+    /// The family's parameters, a column each.
+    pub parameters: &'a [Column],
+    /// The laws and the budgets.
+    pub given: &'a [(L, Budget)],
+    /// The realised outcomes o.
+    pub outcomes: &'a [L::Outcome],
+    /// Receives log delta(o).
+    pub log_ratio: &'a mut Column,
+    /// Receives the entropy or its lower bound, as [`Perturbation::entropy`].
+    pub entropy: &'a mut Column,
+    /// Receives the gradient of log delta(o) by the parameters.
+    pub score: &'a mut [Column],
+    /// Receives that of the entropy.
+    pub entropy_gradient: &'a mut [Column],
 }
 
 /// One admissible perturbation delta_t of a law P_t.

@@ -18,7 +18,7 @@
 use super::gaussian::{Component, Gradient, MOST};
 use super::normal::{below, density, quantile};
 use super::squashed::Squashed;
-use nalgebra::{Vector1, Vector2};
+use nalgebra::Vector2;
 use rand::{Rng, RngExt};
 
 /// What zero parameters mean for each step's a, before squashing: as likely as not first, then rarer.
@@ -43,7 +43,7 @@ pub struct Probit {
 impl Probit {
     /// The slope w, per standard deviation of the noise.
     pub fn slope(&self) -> Vector2<f64> {
-        self.slope.value
+        self.slope.value.into()
     }
 
     /// The threshold a, in standard deviations of T.
@@ -53,7 +53,7 @@ impl Probit {
 
     /// w.xi - s a.
     fn argument(&self, xi: Vector2<f64>) -> f64 {
-        self.slope.value.dot(&xi) - self.scale * self.threshold()
+        self.slope().dot(&xi) - self.scale * self.threshold()
     }
 }
 
@@ -63,10 +63,10 @@ impl Component for Probit {
     const PARAMETERS: usize = 3;
 
     fn new(parameters: &[f64], index: usize, center: f64, curvature: f64) -> Self {
-        let slope = Squashed::new(Vector2::new(parameters[0], parameters[1]), curvature.sqrt());
+        let slope = Squashed::new([parameters[0], parameters[1]], curvature.sqrt());
         let bound = center.min(LARGEST);
-        let threshold = Squashed::new(Vector1::new(NEUTRAL[index] + parameters[2]), bound);
-        let scale = (1.0 + slope.value.norm_squared()).sqrt();
+        let threshold = Squashed::new([NEUTRAL[index] + parameters[2]], bound);
+        let scale = (1.0 + Vector2::from(slope.value).norm_squared()).sqrt();
         Probit { slope, threshold, scale, mass: below(-threshold.value[0]) }
     }
 
@@ -83,7 +83,7 @@ impl Component for Probit {
         let beyond = (1.0 - random.random::<f64>()) * self.mass;
         let t = -quantile(beyond);
         // z with its part along w shrunk by 1/s has the covariance I - w w'/s^2.
-        let (w, s) = (self.slope.value, self.scale);
+        let (w, s) = (self.slope(), self.scale);
         let shrink = w.dot(&z) / (s * (s + 1.0));
         w * (t / s - shrink) + z
     }
@@ -95,14 +95,13 @@ impl Component for Probit {
 
     fn pull_back(&self, xi: Vector2<f64>, by: Gradient, gradient: &mut [f64]) {
         let Gradient { by_ratio, by_supremum, by_lost } = by;
-        let (w, a, s) = (self.slope.value, self.threshold(), self.scale);
+        let (w, a, s) = (self.slope(), self.threshold(), self.scale);
         let steepness = by_ratio * mills(self.argument(xi));
         // ds/dw = w/s.
         let by_slope = (xi - w * (a / s)) * steepness + w * (by_lost / (s * s));
         let by_threshold = (by_ratio + by_supremum) * mills(-a) - steepness * s;
-        gradient[..2].copy_from_slice(self.slope.pull_back(by_slope).as_slice());
-        let by_threshold = Vector1::new(by_threshold);
-        gradient[2..].copy_from_slice(self.threshold.pull_back(by_threshold).as_slice());
+        gradient[..2].copy_from_slice(&self.slope.pull_back(by_slope.into()));
+        gradient[2..].copy_from_slice(&self.threshold.pull_back([by_threshold]));
     }
 
     /// With the probability that T exceeds a from that of its complement.
@@ -111,7 +110,8 @@ impl Component for Probit {
     }
 }
 
-/// d log Phi(x) / dx = phi(x) / Phi(x).
+/// d log Phi(x) / dx = phi(x) / Phi(x); far out in the tail, where Phi(x) is hardly a number, by the first terms of
+/// its expansion, which are right to 1e-8 there.
 fn mills(x: f64) -> f64 {
-    if x < -30.0 { -x } else { density(x) / below(x) }
+    if x < -30.0 { -x - 1.0 / x + 2.0 / x.powi(3) } else { density(x) / below(x) }
 }

@@ -1,5 +1,6 @@
 //! Adam (Kingma & Ba 2015) over one flat vector, with all of its state accessible.
 
+use pulp::{Arch, Simd, WithSimd};
 use serde::{Deserialize, Serialize};
 
 /// Decay rates and the guard of the division, as everywhere in PPO (epsilon is CleanRL's).
@@ -35,8 +36,28 @@ impl Adam {
         let correction = BETA.map(|beta| 1.0 - beta.powf(self.steps as f64));
         let step = (learning_rate / correction[0]) as f32;
         let root = 1.0 / correction[1].sqrt() as f32;
+        let moments = [&mut self.first_moment[..], &mut self.second_moment];
+        Arch::new().dispatch(Step { parameters, gradient, moments, step, root });
+    }
+}
+
+/// The arithmetic of a step, with the processor's widest vectors.
+struct Step<'a> {
+    parameters: &'a mut [f32],
+    gradient: &'a [f32],
+    moments: [&'a mut [f32]; 2],
+    step: f32,
+    root: f32,
+}
+
+impl WithSimd for Step<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn with_simd<S: Simd>(self, _: S) {
+        let Step { parameters, gradient, moments: [first, second], step, root } = self;
         let [beta_1, beta_2] = BETA.map(|beta| beta as f32);
-        let moments = self.first_moment.iter_mut().zip(&mut self.second_moment);
+        let moments = first.iter_mut().zip(second);
         for ((parameter, &g), (m, v)) in parameters.iter_mut().zip(gradient).zip(moments) {
             *m = beta_1 * *m + (1.0 - beta_1) * g;
             *v = beta_2 * *v + (1.0 - beta_2) * g * g;

@@ -8,7 +8,8 @@
 use super::options::TrainOptions;
 use super::policy::Mode;
 use crate::game::budget::Budget;
-use crate::game::perturbation::{Family, Perturbation};
+use crate::game::columns::{self, Column, Loops, SAMPLES, exp, ln};
+use crate::game::perturbation::{self, Family, Perturbation};
 use lava_envs::Force;
 use lava_envs::action::{Action, ActionKind, Discrete, Finite};
 use lava_envs::law::{FiniteLaw, GaussianLaw, Law};
@@ -53,6 +54,43 @@ pub trait Head: Clone + std::fmt::Debug {
         score: &mut [f64],
         entropy_gradient: &mut [f64],
     ) -> (f64, f64);
+
+    /// The same for a block of samples. Heads override it with columns ([`crate::game::columns`]); this is
+    /// their reference.
+    fn gradients_of_block(&self, block: Block<'_, Self>) {
+        let Block { parameters, given, choices, .. } = block;
+        let count = parameters.len();
+        let [mut own, mut by_choice, mut by_entropy] = [(); 3].map(|()| vec![0.0; count]);
+        for (i, (given, choice)) in given.iter().zip(choices).enumerate() {
+            for (own, column) in own.iter_mut().zip(parameters) {
+                *own = column[i];
+            }
+            (block.log_probability[i], block.entropy[i]) =
+                self.gradients(&own, given, choice, &mut by_choice, &mut by_entropy);
+            for k in 0..count {
+                block.score[k][i] = by_choice[k];
+                block.entropy_gradient[k][i] = by_entropy[k];
+            }
+        }
+    }
+}
+
+/// At most `SAMPLES` samples, and what learning needs of their laws.
+pub struct Block<'a, H: Head> {
+    /// The head's parameters, a column each.
+    pub parameters: &'a [Column],
+    /// What the laws depend on besides.
+    pub given: &'a [H::Given],
+    /// What was chosen.
+    pub choices: &'a [H::Choice],
+    /// Receives the log-probabilities of the choices.
+    pub log_probability: &'a mut Column,
+    /// Receives the entropies of the laws.
+    pub entropy: &'a mut Column,
+    /// Receives the gradient of the log-probability by the parameters.
+    pub score: &'a mut [Column],
+    /// Receives that of the entropy.
+    pub entropy_gradient: &'a mut [Column],
 }
 
 /// A protagonist's head: a law of actions, which is a law of noise and a map from noise to actions.
@@ -200,6 +238,57 @@ impl<A: Discrete, const N: usize> Head for CategoricalPolicy<A, N> {
         }
         (log_probability, entropy)
     }
+
+    fn gradients_of_block(&self, block: Block<'_, Self>) {
+        columns::widest(CategoricalBlock(block));
+    }
+}
+
+struct CategoricalBlock<'a, A: Discrete, const N: usize>(Block<'a, CategoricalPolicy<A, N>>);
+
+impl<A: Discrete, const N: usize> Loops for CategoricalBlock<'_, A, N> {
+    #[inline(always)]
+    fn run(self) {
+        let Block {
+            parameters, choices, log_probability, entropy, score, entropy_gradient, ..
+        } = self.0;
+        let mut choice = [0.0; SAMPLES];
+        for (column, chosen) in choice.iter_mut().zip(choices) {
+            *column = chosen.index() as f64;
+        }
+        let mut shift = parameters[0];
+        for logit in &parameters[1..] {
+            for i in 0..SAMPLES {
+                shift[i] = if logit[i] > shift[i] { logit[i] } else { shift[i] };
+            }
+        }
+        let mut sum = [0.0; SAMPLES];
+        for logit in parameters {
+            for i in 0..SAMPLES {
+                sum[i] += exp(logit[i] - shift[i]);
+            }
+        }
+        for i in 0..SAMPLES {
+            shift[i] += ln(sum[i]);
+            entropy[i] = 0.0;
+        }
+        for (k, logit) in parameters.iter().enumerate() {
+            let (score, log) = (&mut score[k], &mut entropy_gradient[k]);
+            for i in 0..SAMPLES {
+                let chosen = choice[i] == k as f64;
+                log[i] = logit[i] - shift[i];
+                let probability = exp(log[i]);
+                entropy[i] -= probability * log[i];
+                log_probability[i] = if chosen { log[i] } else { log_probability[i] };
+                score[i] = if chosen { 1.0 - probability } else { -probability };
+            }
+        }
+        for gradient in entropy_gradient {
+            for i in 0..SAMPLES {
+                gradient[i] = -exp(gradient[i]) * (gradient[i] + entropy[i]);
+            }
+        }
+    }
 }
 
 impl<A: Discrete, const N: usize> PolicyHead for CategoricalPolicy<A, N> {
@@ -281,6 +370,40 @@ impl Head for GaussianPolicy {
         }
         (log_probability, entropy)
     }
+
+    fn gradients_of_block(&self, block: Block<'_, Self>) {
+        columns::widest(GaussianBlock(block));
+    }
+}
+
+struct GaussianBlock<'a>(Block<'a, GaussianPolicy>);
+
+impl Loops for GaussianBlock<'_> {
+    #[inline(always)]
+    fn run(self) {
+        let Block {
+            parameters, choices, log_probability, entropy, score, entropy_gradient, ..
+        } = self.0;
+        log_probability.fill(-LOG_2_PI);
+        entropy.fill(1.0 + LOG_2_PI);
+        for axis in 0..2 {
+            let mut choice = [0.0; SAMPLES];
+            for (column, force) in choice.iter_mut().zip(choices) {
+                *column = force.0[axis];
+            }
+            let (mean, log_std) = (&parameters[axis], &parameters[2 + axis]);
+            for i in 0..SAMPLES {
+                let per_std = exp(-log_std[i]);
+                let z = (choice[i] - mean[i]) * per_std;
+                log_probability[i] += -0.5 * z * z - log_std[i];
+                entropy[i] += log_std[i];
+                score[axis][i] = z * per_std;
+                score[2 + axis][i] = z * z - 1.0;
+            }
+            entropy_gradient[axis].fill(0.0);
+            entropy_gradient[2 + axis].fill(1.0);
+        }
+    }
 }
 
 impl PolicyHead for GaussianPolicy {
@@ -338,5 +461,25 @@ impl<F: Family> Head for AntagonistHead<F> {
         let ratio = perturbation.score(*outcome, score);
         let entropy = perturbation.entropy(entropy_gradient);
         (law.log_density(*outcome) + ratio.ln(), entropy)
+    }
+
+    fn gradients_of_block(&self, block: Block<'_, Self>) {
+        let Block { parameters, given, choices: outcomes, .. } = block;
+        let Block { log_probability, entropy, score, entropy_gradient, .. } = block;
+        let log_ratio = &mut *log_probability;
+        self.0.learn(perturbation::Block {
+            parameters,
+            given,
+            outcomes,
+            log_ratio,
+            entropy,
+            score,
+            entropy_gradient,
+        });
+        for (log, ((law, _), &outcome)) in
+            log_probability.iter_mut().zip(given.iter().zip(outcomes))
+        {
+            *log += law.log_density(outcome);
+        }
     }
 }

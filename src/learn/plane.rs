@@ -12,7 +12,7 @@
 //! The actor's outputs o give the centre `m = B tanh(o/B)` with B = 3/2, beyond the border of the square so
 //! that the mode can lie on it. The constants c give the spread, `log s = log 0.05 + log(60) sigmoid(c)`.
 
-use super::head::{GaussianPolicy, Head, HeadOf, PolicyHead};
+use super::head::{Block, GaussianPolicy, Head, HeadOf, PolicyHead};
 use super::options::{PlaneLaw, TrainOptions};
 use super::truncated_normal::TruncatedNormal;
 use lava_envs::action::Plane;
@@ -232,6 +232,20 @@ impl Head for PlanePolicy {
         entropy_gradient: &mut [f64],
     ) -> (f64, f64) {
         selected!(self, head => head.gradients(parameters, given, choice, score, entropy_gradient))
+    }
+
+    fn gradients_of_block(&self, block: Block<'_, Self>) {
+        let Block { parameters, given, choices, log_probability, entropy, score, entropy_gradient } =
+            block;
+        selected!(self, head => head.gradients_of_block(Block {
+            parameters,
+            given,
+            choices,
+            log_probability,
+            entropy,
+            score,
+            entropy_gradient,
+        }));
     }
 }
 

@@ -10,11 +10,12 @@
 //! Its gradient by the outputs of actor and critic is written out in [`Loss`]; the networks propagate it
 //! to the parameters.
 
+use crate::game::columns::{self, Column, Loops, SAMPLES, exp};
 use crate::learn::adam::Adam;
 use crate::learn::budget_sensitivity::BudgetSensitivity;
 use crate::learn::device::Device;
 use crate::learn::gae::{self, Estimates};
-use crate::learn::head::Head;
+use crate::learn::head::{Block, Head};
 use crate::learn::inputs::{Columns, Inputs};
 use crate::learn::network::{Network, Outputs, Shape};
 use crate::learn::options::PlayerOptions;
@@ -309,22 +310,44 @@ impl<H: Head> Player<H> {
     }
 }
 
-/// The loss of a minibatch and its gradient by the outputs of the network, block by block.
+/// The loss of a minibatch and its gradient by the outputs of the network, block by block. All that is of single
+/// samples is in columns ([`crate::game::columns`]).
 pub struct Loss<'a, H: Head> {
     head: &'a H,
     samples: &'a [Sample<H>],
-    options: &'a PlayerOptions,
+    terms: Terms,
+    given: Vec<H::Given>,
+    choices: Vec<H::Choice>,
+    /// Parameters of the head; the constants are in place.
+    parameters: Vec<Column>,
+    score: Vec<Column>,
+    entropy_gradient: Vec<Column>,
+    sums: Sums,
+}
+
+/// What the loss of a sample depends on besides the sample.
+#[derive(Clone, Copy)]
+struct Terms {
+    clip: f64,
     entropy_weight: f64,
+    value_coefficient: f64,
     /// Of the minibatch's advantages.
     mean: f64,
     /// 1 over their standard deviation.
     scale: f64,
-    /// Parameters of the head; the constants are in place.
-    parameters: Vec<f64>,
-    by_constants: Vec<f64>,
-    score: Vec<f64>,
-    by_entropy: Vec<f64>,
-    losses: Losses,
+    /// 1 over the number of samples.
+    share: f64,
+}
+
+/// Sums over the blocks of a minibatch, to be summed over the columns.
+struct Sums {
+    policy_loss: Column,
+    value_loss: Column,
+    entropy: Column,
+    approx_kl: Column,
+    clipped: Column,
+    /// Of the gradient by each of the head's constants.
+    by_constants: Vec<Column>,
 }
 
 impl<'a, H: Head> Loss<'a, H> {
@@ -340,89 +363,186 @@ impl<'a, H: Head> Loss<'a, H> {
         let mean = samples.iter().map(|s| f64::from(s.advantage)).sum::<f64>() / number;
         let variance = samples.iter().map(|s| (f64::from(s.advantage) - mean).powi(2)).sum::<f64>()
             / (number - 1.0).max(1.0);
-        let scale = 1.0 / (variance.sqrt() + 1e-8);
-        let mut parameters = vec![0.0; head.outputs()];
-        parameters.extend(constants.iter().map(|&constant| f64::from(constant)));
+        let terms = Terms {
+            clip: options.clip,
+            entropy_weight,
+            value_coefficient: options.value_coefficient,
+            mean,
+            scale: 1.0 / (variance.sqrt() + 1e-8),
+            share: 1.0 / number,
+        };
+        let none = [0.0; SAMPLES];
+        let mut parameters = vec![none; head.outputs()];
+        parameters.extend(constants.iter().map(|&constant| [f64::from(constant); SAMPLES]));
         let count = parameters.len();
         Loss {
             head,
             samples,
-            options,
-            entropy_weight,
-            mean,
-            scale,
+            terms,
+            given: Vec::with_capacity(SAMPLES),
+            choices: Vec::with_capacity(SAMPLES),
             parameters,
-            by_constants: vec![0.0; count],
-            score: vec![0.0; count],
-            by_entropy: vec![0.0; count],
-            losses: Losses::default(),
+            score: vec![none; count],
+            entropy_gradient: vec![none; count],
+            sums: Sums {
+                policy_loss: none,
+                value_loss: none,
+                entropy: none,
+                approx_kl: none,
+                clipped: none,
+                by_constants: vec![none; constants.len()],
+            },
         }
     }
 
     /// The same with advantages that are not centred, and scaled by their root mean square.
-    pub fn uncentred(self) -> Self {
+    pub fn uncentred(mut self) -> Self {
         let squares = self.samples.iter().map(|s| f64::from(s.advantage).powi(2)).sum::<f64>();
-        let scale = 1.0 / ((squares / self.samples.len() as f64).sqrt() + 1e-8);
-        Loss { mean: 0.0, scale, ..self }
+        self.terms.mean = 0.0;
+        self.terms.scale = 1.0 / ((squares / self.samples.len() as f64).sqrt() + 1e-8);
+        self
     }
 
     /// Adds the samples of a block, whose y holds the actor's outputs and below them the values.
     pub fn add(&mut self, block: Outputs<'_>) {
         let Outputs { start, samples, y, stride } = block;
-        let options = self.options;
-        let share = 1.0 / self.samples.len() as f64;
-        let outputs = self.head.outputs();
-        let Loss { parameters, score, by_entropy, by_constants, losses, .. } = self;
-        for (column, sample) in self.samples[start..start + samples].iter().enumerate() {
-            for (i, parameter) in parameters[..outputs].iter_mut().enumerate() {
-                *parameter = f64::from(y[i * stride + column]);
-            }
-            let (log_probability, entropy) =
-                self.head.gradients(parameters, &sample.given, &sample.choice, score, by_entropy);
-            let log_ratio = log_probability - sample.log_probability;
-            let ratio = log_ratio.exp();
-            let advantage = (f64::from(sample.advantage) - self.mean) * self.scale;
-            let clipped = ratio.clamp(1.0 - options.clip, 1.0 + options.clip);
-            let surrogate = (ratio * advantage).min(clipped * advantage);
-            // Where the clipped branch is the smaller one it is constant in the parameters.
-            let by_log_probability = if ratio * advantage <= clipped * advantage {
-                -share * ratio * advantage
-            } else {
-                0.0
-            };
-            let value = &mut y[outputs * stride + column];
-            let error = f64::from(*value) - f64::from(sample.target);
-            *value = (2.0 * options.value_coefficient * share * error) as f32;
+        for first in (0..samples).step_by(SAMPLES) {
+            let count = SAMPLES.min(samples - first);
+            self.add_columns(start + first, count, &mut y[first..], stride);
+        }
+    }
 
-            losses.policy_loss -= share * surrogate;
-            losses.value_loss += share * error * error;
-            losses.entropy += share * entropy;
-            losses.approx_kl += share * (ratio - 1.0 - log_ratio);
-            losses.clip_fraction += share * f64::from(u8::from(ratio != clipped));
-
-            let entropy_weight = share * self.entropy_weight;
-            let gradient =
-                |i: usize| by_log_probability * score[i] - entropy_weight * by_entropy[i];
-            for i in 0..outputs {
-                y[i * stride + column] = gradient(i) as f32;
+    fn add_columns(&mut self, start: usize, count: usize, y: &mut [f32], stride: usize) {
+        let Loss { head, samples, terms, given, choices, sums, .. } = self;
+        let Loss { parameters, score, entropy_gradient, .. } = self;
+        let samples = &samples[start..start + count];
+        given.clear();
+        given.extend(samples.iter().map(|sample| sample.given));
+        choices.clear();
+        choices.extend(samples.iter().map(|sample| sample.choice));
+        let none = [0.0; SAMPLES];
+        let outputs = head.outputs();
+        for (column, row) in parameters[..outputs].iter_mut().zip(y.chunks(stride)) {
+            *column = none;
+            for (parameter, &output) in column.iter_mut().zip(&row[..count]) {
+                *parameter = f64::from(output);
             }
-            for (i, sum) in by_constants[outputs..].iter_mut().enumerate() {
-                *sum += gradient(outputs + i);
+        }
+        let (mut log_probability, mut entropy) = (none, none);
+        head.gradients_of_block(Block {
+            parameters,
+            given,
+            choices,
+            log_probability: &mut log_probability,
+            entropy: &mut entropy,
+            score,
+            entropy_gradient,
+        });
+        let (mut old, mut advantage, mut target, mut value) = (none, none, none, none);
+        // A share of 0 leaves out what is no sample.
+        let mut share = none;
+        for (i, sample) in samples.iter().enumerate() {
+            old[i] = sample.log_probability;
+            advantage[i] = f64::from(sample.advantage);
+            target[i] = f64::from(sample.target);
+            value[i] = f64::from(y[outputs * stride + i]);
+            share[i] = terms.share;
+        }
+        columns::widest(Clipped {
+            terms: *terms,
+            share: &share,
+            log_probability: &log_probability,
+            old: &old,
+            advantage: &advantage,
+            entropy: &entropy,
+            target: &target,
+            value: &mut value,
+            score,
+            entropy_gradient,
+            sums,
+        });
+        let gradient = self.score[..outputs].iter().chain([&value]);
+        for (row, column) in y.chunks_mut(stride).zip(gradient) {
+            for (entry, &by_output) in row[..count].iter_mut().zip(column) {
+                *entry = by_output as f32;
             }
         }
     }
 
     /// Writes the gradient by the head's constants and returns the losses.
     pub fn finish(self, by_constants: &mut [f32]) -> Losses {
-        for (slot, value) in by_constants.iter_mut().zip(&self.by_constants[self.head.outputs()..])
-        {
-            *slot = *value as f32;
+        let sum = |column: &Column| column.iter().sum::<f64>();
+        for (slot, column) in by_constants.iter_mut().zip(&self.sums.by_constants) {
+            *slot = sum(column) as f32;
         }
-        self.losses
+        Losses {
+            policy_loss: sum(&self.sums.policy_loss),
+            value_loss: sum(&self.sums.value_loss),
+            entropy: sum(&self.sums.entropy),
+            approx_kl: sum(&self.sums.approx_kl),
+            clip_fraction: sum(&self.sums.clipped),
+            ..Losses::default()
+        }
     }
 }
 
-/// Scales the gradient down to `limit` if it is longer; returns its norm before that.
+/// The clipped surrogate, the bonus and the critic's error of a block of samples.
+struct Clipped<'a> {
+    terms: Terms,
+    share: &'a Column,
+    log_probability: &'a Column,
+    old: &'a Column,
+    advantage: &'a Column,
+    entropy: &'a Column,
+    target: &'a Column,
+    /// V, to be turned into the gradient by it.
+    value: &'a mut Column,
+    /// Gradients of the log-probability by the parameters, to be turned into those of the loss.
+    score: &'a mut [Column],
+    entropy_gradient: &'a [Column],
+    sums: &'a mut Sums,
+}
+
+impl Loops for Clipped<'_> {
+    #[inline(always)]
+    fn run(self) {
+        let Clipped { terms, share, log_probability, old, advantage, entropy, target, .. } = self;
+        let Clipped { value, score, entropy_gradient, sums, .. } = self;
+        let mut by_log_probability = [0.0; SAMPLES];
+        for i in 0..SAMPLES {
+            let log_ratio = log_probability[i] - old[i];
+            let ratio = exp(log_ratio);
+            let advantage = (advantage[i] - terms.mean) * terms.scale;
+            let (least, most) = (1.0 - terms.clip, 1.0 + terms.clip);
+            let clipped = if ratio < least { least } else { ratio };
+            let clipped = if clipped > most { most } else { clipped };
+            // Where the clipped branch is the smaller one it is constant in the parameters.
+            let follows = ratio * advantage <= clipped * advantage;
+            let surrogate = if follows { ratio } else { clipped } * advantage;
+            by_log_probability[i] = if follows { -share[i] * ratio * advantage } else { 0.0 };
+            let error = value[i] - target[i];
+            value[i] = 2.0 * terms.value_coefficient * share[i] * error;
+            sums.policy_loss[i] -= share[i] * surrogate;
+            sums.value_loss[i] += share[i] * error * error;
+            sums.entropy[i] += share[i] * entropy[i];
+            sums.approx_kl[i] += share[i] * (ratio - 1.0 - log_ratio);
+            sums.clipped[i] += if ratio == clipped { 0.0 } else { share[i] };
+        }
+        for (score, by_entropy) in score.iter_mut().zip(entropy_gradient) {
+            for i in 0..SAMPLES {
+                let bonus = terms.entropy_weight * share[i] * by_entropy[i];
+                score[i] = by_log_probability[i] * score[i] - bonus;
+            }
+        }
+        let outputs = score.len() - sums.by_constants.len();
+        for (sum, column) in sums.by_constants.iter_mut().zip(&score[outputs..]) {
+            for i in 0..SAMPLES {
+                sum[i] += column[i];
+            }
+        }
+    }
+}
+
 fn clip_norm(gradient: &mut [f32], limit: f64) -> f64 {
     let norm = gradient.iter().map(|&g| f64::from(g) * f64::from(g)).sum::<f64>().sqrt();
     if norm > limit {

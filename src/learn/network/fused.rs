@@ -3,14 +3,14 @@
 //!
 //! With so few inputs and outputs, general matrix products spend most of their time on packing, and
 //! every step of a whole minibatch through memory costs more than its arithmetic. A block holds its
-//! numbers sample by sample in rows: row i of `x` is input i of all its samples.
+//! numbers sample by sample in rows: row i of `x` is input i of all its samples. Two loops make all sums:
+//! `combine` those over the terms of a linear map, `correlate` those over samples. What they load they use four
+//! times, in a tile of sums that stays in registers.
 
 use super::{Outputs, Shape};
+use crate::game::columns::SAMPLES;
 use crate::learn::inputs::Rows;
 use pulp::{Arch, Simd, WithSimd};
-
-/// Samples of a block: a multiple of the width of any vector register.
-const SAMPLES: usize = 32;
 
 /// Numbers that begin at a multiple of 64 bytes: a vector load then stays within one cache line.
 #[derive(Debug, Default)]
@@ -74,6 +74,178 @@ fn load(inputs: &[f32], width: usize, x: &mut [f32]) {
     }
 }
 
+/// Vectors of a tile.
+const VECTORS: usize = 4;
+
+/// What a sum and the number in its place become.
+#[derive(Clone, Copy)]
+enum Finish {
+    /// Their sum.
+    Sum,
+    /// tanh of the sum.
+    Tanh,
+    /// tanh of their sum.
+    TanhOfBoth,
+    /// The sum times the slope of tanh, given tanh: d tanh = 1 - tanh^2.
+    TimesSlope,
+}
+
+impl Finish {
+    #[inline(always)]
+    fn of<S: Simd>(self, simd: S, sum: S::f32s, place: S::f32s) -> S::f32s {
+        match self {
+            Finish::Sum => simd.add_f32s(sum, place),
+            Finish::Tanh => tanh(simd, sum),
+            Finish::TanhOfBoth => tanh(simd, simd.add_f32s(sum, place)),
+            Finish::TimesSlope => {
+                let slope = simd.sub_f32s(simd.splat_f32s(1.0), simd.mul_f32s(place, place));
+                simd.mul_f32s(sum, slope)
+            }
+        }
+    }
+}
+
+/// Where a weight of a linear map is: `at + row * of_row + term * of_term`.
+#[derive(Clone, Copy)]
+struct Weights<'a> {
+    all: &'a [f32],
+    at: usize,
+    of_row: usize,
+    of_term: usize,
+}
+
+/// `out[row] = finish(out[row] + sum_term w[row, term] * terms[term])`, rows of a block each.
+#[inline(always)]
+fn combine<S: Simd>(
+    simd: S,
+    weights: Weights<'_>,
+    terms: &[S::f32s],
+    out: &mut [S::f32s],
+    finish: Finish,
+) {
+    let vectors = SAMPLES / S::F32_LANES;
+    let rows = out.len() / vectors;
+    let mut row = 0;
+    while row < rows {
+        let tile = &mut out[row * vectors..];
+        let weights = Weights { at: weights.at + row * weights.of_row, ..weights };
+        row += match rows - row {
+            1 => combine_tile::<S, 1>(simd, weights, terms, tile, finish),
+            2 => combine_tile::<S, 2>(simd, weights, terms, tile, finish),
+            3 => combine_tile::<S, 3>(simd, weights, terms, tile, finish),
+            _ => combine_tile::<S, 4>(simd, weights, terms, tile, finish),
+        };
+    }
+}
+
+#[inline(always)]
+fn combine_tile<S: Simd, const R: usize>(
+    simd: S,
+    weights: Weights<'_>,
+    terms: &[S::f32s],
+    out: &mut [S::f32s],
+    finish: Finish,
+) -> usize {
+    let vectors = SAMPLES / S::F32_LANES;
+    let out = &mut out[..R * vectors];
+    for vector in (0..vectors).step_by(VECTORS) {
+        let mut sums = [[simd.splat_f32s(0.0); VECTORS]; R];
+        for (term, of) in terms.chunks_exact(vectors).enumerate() {
+            let of = &of[vector..][..VECTORS];
+            for (row, sums) in sums.iter_mut().enumerate() {
+                let at = weights.at + row * weights.of_row + term * weights.of_term;
+                let weight = simd.splat_f32s(weights.all[at]);
+                for (sum, &of) in sums.iter_mut().zip(of) {
+                    *sum = simd.mul_add_e_f32s(weight, of, *sum);
+                }
+            }
+        }
+        for (sums, out) in sums.iter().zip(out.chunks_exact_mut(vectors)) {
+            for (&sum, place) in sums.iter().zip(&mut out[vector..]) {
+                *place = finish.of(simd, sum, *place);
+            }
+        }
+    }
+    R
+}
+
+/// `sums[i, j] += a[i] * b[j]`, summed over the samples of the block but for the lanes.
+#[inline(always)]
+fn correlate<S: Simd>(simd: S, a: &[S::f32s], b: &[S::f32s], sums: &mut [S::f32s]) {
+    let vectors = SAMPLES / S::F32_LANES;
+    let columns = b.len() / vectors;
+    let rows = a.len() / vectors;
+    let mut row = 0;
+    while row < rows {
+        let a = &a[row * vectors..];
+        let sums = &mut sums[row * columns..];
+        row += match rows - row {
+            1 => correlate_rows::<S, 1>(simd, a, b, sums),
+            2 => correlate_rows::<S, 2>(simd, a, b, sums),
+            3 => correlate_rows::<S, 3>(simd, a, b, sums),
+            _ => correlate_rows::<S, 4>(simd, a, b, sums),
+        };
+    }
+}
+
+#[inline(always)]
+fn correlate_rows<S: Simd, const R: usize>(
+    simd: S,
+    a: &[S::f32s],
+    b: &[S::f32s],
+    sums: &mut [S::f32s],
+) -> usize {
+    let vectors = SAMPLES / S::F32_LANES;
+    let columns = b.len() / vectors;
+    let mut column = 0;
+    while column < columns {
+        let (b, sums) = (&b[column * vectors..], &mut sums[column..]);
+        column += match columns - column {
+            1 => correlate_tile::<S, R, 1>(simd, a, b, sums, columns),
+            2 => correlate_tile::<S, R, 2>(simd, a, b, sums, columns),
+            3 => correlate_tile::<S, R, 3>(simd, a, b, sums, columns),
+            _ => correlate_tile::<S, R, 4>(simd, a, b, sums, columns),
+        };
+    }
+    R
+}
+
+#[inline(always)]
+fn correlate_tile<S: Simd, const R: usize, const C: usize>(
+    simd: S,
+    a: &[S::f32s],
+    b: &[S::f32s],
+    sums: &mut [S::f32s],
+    stride: usize,
+) -> usize {
+    let vectors = SAMPLES / S::F32_LANES;
+    let (a, b) = (&a[..R * vectors], &b[..C * vectors]);
+    let sums = &mut sums[..(R - 1) * stride + C];
+    let mut own = [[simd.splat_f32s(0.0); C]; R];
+    for row in 0..R {
+        for column in 0..C {
+            own[row][column] = sums[row * stride + column];
+        }
+    }
+    for v in 0..vectors {
+        for row in 0..R {
+            for column in 0..C {
+                own[row][column] = simd.mul_add_e_f32s(
+                    a[row * vectors + v],
+                    b[column * vectors + v],
+                    own[row][column],
+                );
+            }
+        }
+    }
+    for row in 0..R {
+        for column in 0..C {
+            sums[row * stride + column] = own[row][column];
+        }
+    }
+    C
+}
+
 /// h = tanh(W x) of as many hidden units as `h` has rows, from `first` on.
 #[inline(always)]
 fn hidden_layer<S: Simd>(
@@ -86,50 +258,42 @@ fn hidden_layer<S: Simd>(
     h: &mut [f32],
 ) {
     let units = 2 * shape.hidden;
-    let (columns, weights) = parameters.split_at(shape.columns.cells * units);
-    // What a cell adds to z is its column of W.
-    h.fill(0.0);
-    for (sample, &cell) in cells.iter().enumerate() {
-        let column = &columns[cell as usize * units + first..];
-        for (z, &weight) in h.chunks_exact_mut(SAMPLES).zip(column) {
-            z[sample] = weight;
-        }
-    }
-    let (x, _) = S::as_simd_f32s(x);
-    let (h, _) = S::as_mut_simd_f32s(h);
-    let vectors = SAMPLES / S::F32_LANES;
-    for (unit, h) in h.chunks_exact_mut(vectors).enumerate() {
-        for (vector, h) in h.iter_mut().enumerate() {
-            let mut z = *h;
-            for (input, x) in x.chunks_exact(vectors).enumerate() {
-                let weight = simd.splat_f32s(weights[input * units + first + unit]);
-                z = simd.mul_add_e_f32s(weight, x[vector], z);
+    let (columns, numbers) = parameters.split_at(shape.columns.cells * units);
+    let weights = Weights { all: numbers, at: first, of_row: 1, of_term: units };
+    let x = S::as_simd_f32s(x).0;
+    if shape.columns.cells == 0 {
+        combine(simd, weights, x, S::as_mut_simd_f32s(h).0, Finish::Tanh);
+    } else {
+        // What a cell adds to z is its column of W.
+        for (sample, &cell) in cells.iter().enumerate() {
+            let column = &columns[cell as usize * units + first..];
+            for (z, &weight) in h.chunks_exact_mut(SAMPLES).zip(column) {
+                z[sample] = weight;
             }
-            *h = tanh(simd, z);
         }
+        let h = S::as_mut_simd_f32s(h).0;
+        combine(simd, weights, x, h, Finish::TanhOfBoth);
     }
 }
 
-/// A row of V h + b.
+/// Rows of V h + b, of the actor or of the critic.
 #[inline(always)]
-fn output<S: Simd>(simd: S, weights: &[f32], bias: f32, h: &[f32], y: &mut [f32]) {
-    // Several independent sums: an addition depends only on the previous one of its own sum.
-    const SUMS: usize = 4;
-    let (h, _) = S::as_simd_f32s(h);
-    let (y, _) = S::as_mut_simd_f32s(y);
-    let vectors = SAMPLES / S::F32_LANES;
-    for (vector, y) in y.iter_mut().enumerate() {
-        let mut sums = [simd.splat_f32s(0.0); SUMS];
-        sums[0] = simd.splat_f32s(bias);
-        for (weights, h) in weights.chunks(SUMS).zip(h.chunks(SUMS * vectors)) {
-            for (i, &weight) in weights.iter().enumerate() {
-                let h = h[i * vectors + vector];
-                sums[i] = simd.mul_add_e_f32s(simd.splat_f32s(weight), h, sums[i]);
-            }
-        }
-        let [a, b, c, d] = sums;
-        *y = simd.add_f32s(simd.add_f32s(a, b), simd.add_f32s(c, d));
+fn output_rows<S: Simd>(
+    simd: S,
+    shape: Shape,
+    parameters: &[f32],
+    rows: std::ops::Range<usize>,
+    h: &[f32],
+    y: &mut [f32],
+) {
+    let first = shape.half(rows.start).start;
+    for (y, bias) in y.chunks_exact_mut(SAMPLES).zip(&parameters[shape.bias_at() + rows.start..]) {
+        y.fill(*bias);
     }
+    let at = shape.second_at(rows.start, first);
+    let weights = Weights { all: parameters, at, of_row: 2 * shape.hidden, of_term: 1 };
+    let (h, y) = (S::as_simd_f32s(h).0, S::as_mut_simd_f32s(y).0);
+    combine(simd, weights, h, y, Finish::Sum);
 }
 
 /// Some rows of y on a batch.
@@ -166,18 +330,16 @@ impl WithSimd for Evaluate<'_> {
         outputs.resize(rows.len() * samples, 0.0);
         let (mut x, mut h) = (Aligned::default(), Aligned::default());
         let (x, h) = (x.slice(width * SAMPLES), h.slice(hidden * SAMPLES));
-        let mut y = [0.0; SAMPLES];
+        let mut y = Aligned::default();
+        let y = y.slice(rows.len() * SAMPLES);
         for (block, inputs) in inputs.blocks(SAMPLES, width).enumerate() {
             load(inputs.numbers, width, x);
             hidden_layer(simd, shape, parameters, first, inputs.cells, x, h);
             let start = block * SAMPLES;
             let end = samples.min(start + SAMPLES);
-            for (index, row) in rows.clone().enumerate() {
-                let at = shape.second_at(row, first);
-                let bias = parameters[shape.bias_at() + row];
-                output(simd, &parameters[at..at + hidden], bias, h, &mut y);
-                outputs[index * samples + start..index * samples + end]
-                    .copy_from_slice(&y[..end - start]);
+            output_rows(simd, shape, parameters, rows.clone(), h, y);
+            for (row, y) in outputs.chunks_exact_mut(samples).zip(y.chunks_exact(SAMPLES)) {
+                row[start..end].copy_from_slice(&y[..end - start]);
             }
         }
     }
@@ -226,13 +388,10 @@ impl<L: FnMut(Outputs<'_>)> WithSimd for Differentiate<'_, L> {
             let samples = inputs.numbers.len() / width;
             load(inputs.numbers, width, x);
             hidden_layer(simd, shape, parameters, 0, inputs.cells, x, h);
-            for (row, y) in y.chunks_exact_mut(SAMPLES).enumerate() {
-                let units = shape.half(row);
-                let at = shape.second_at(row, units.start);
-                let bias = parameters[shape.bias_at() + row];
-                let h = &h[units.start * SAMPLES..units.end * SAMPLES];
-                output(simd, &parameters[at..at + hidden], bias, h, y);
-            }
+            let (actor, critic) = h.split_at(hidden * SAMPLES);
+            let (action, value) = y.split_at_mut(shape.outputs * SAMPLES);
+            output_rows(simd, shape, parameters, 0..shape.outputs, actor, action);
+            output_rows(simd, shape, parameters, shape.outputs..shape.rows(), critic, value);
             loss(Outputs { start: block * SAMPLES, samples, y: &mut y[..], stride: SAMPLES });
             for (row, y) in y.chunks_exact_mut(SAMPLES).enumerate() {
                 y[samples..].fill(0.0);
@@ -279,28 +438,17 @@ fn backward<S: Simd>(
     let h = S::as_mut_simd_f32s(h).0;
     let (by_first, by_second) = (S::as_mut_simd_f32s(by_first).0, S::as_mut_simd_f32s(by_second).0);
     let vectors = SAMPLES / S::F32_LANES;
-    let (k, hidden, width) = (shape.outputs, shape.hidden, shape.width());
-    for (unit, h) in h.chunks_exact_mut(vectors).enumerate() {
-        let (rows, at) = if unit < hidden { (0..k, unit) } else { (k..k + 1, unit - hidden) };
-        for (vector, entry) in h.iter_mut().enumerate() {
-            let h = *entry;
-            let mut by_h = simd.splat_f32s(0.0);
-            for row in rows.clone() {
-                let y = y[row * vectors + vector];
-                let weight = simd.splat_f32s(parameters[shape.second_at(row, unit)]);
-                by_h = simd.mul_add_e_f32s(weight, y, by_h);
-                let sum = &mut by_second[row * hidden + at];
-                *sum = simd.mul_add_e_f32s(y, h, *sum);
-            }
-            // d tanh = 1 - tanh^2.
-            let slope = simd.sub_f32s(simd.splat_f32s(1.0), simd.mul_f32s(h, h));
-            let by_z = simd.mul_f32s(by_h, slope);
-            *entry = by_z;
-            for (input, sum) in by_first[unit * width..][..width].iter_mut().enumerate() {
-                *sum = simd.mul_add_e_f32s(by_z, x[input * vectors + vector], *sum);
-            }
-        }
+    let (k, hidden) = (shape.outputs, shape.hidden);
+    let (actor, critic) = h.split_at_mut(hidden * vectors);
+    let (by_action, by_value) = y.split_at(k * vectors);
+    let (to_action, to_value) = by_second.split_at_mut(k * hidden);
+    for (row, h, y, sums) in [(0, actor, by_action, to_action), (k, critic, by_value, to_value)] {
+        correlate(simd, y, h, sums);
+        let at = shape.second_at(row, shape.half(row).start);
+        let weights = Weights { all: parameters, at, of_row: 1, of_term: 2 * hidden };
+        combine(simd, weights, y, h, Finish::TimesSlope);
     }
+    correlate(simd, h, x, by_first);
 }
 
 #[cfg(test)]
