@@ -4,15 +4,16 @@
 use approx::assert_relative_eq;
 use cvar_game::game::budget::{Budget, Eta};
 use cvar_game::game::bump::Bump;
+use cvar_game::game::columns::SAMPLES;
 use cvar_game::game::finite::FiniteFamily;
 use cvar_game::game::gaussian::{Component, GaussianFamily, GaussianPerturbation, MOST};
-use cvar_game::game::perturbation::{Family, Perturbation};
+use cvar_game::game::perturbation::{Draws, Family, Perturbation};
 use cvar_game::game::probit::Probit;
 use lava_envs::{FiniteLaw, GaussianLaw, Law};
 use nalgebra::{Matrix2, Vector2};
 use proptest::prelude::*;
-use rand::SeedableRng;
 use rand::rngs::ChaCha8Rng;
+use rand::{RngExt, SeedableRng};
 use std::ops::Range;
 
 fn family<C: Component>(count: usize) -> GaussianFamily<C> {
@@ -193,6 +194,56 @@ proptest! {
         eta in prop_oneof![Just(1.0), 1.05f64..200.0],
     ) {
         check_gradients(&family, &parameters, Vector2::from(xi), eta)?;
+    }
+}
+
+/// Draws in columns are those of the formulas for one sample, with the same random numbers.
+fn check_draws<F: Family>(family: &F, law: F::Law, close: impl Fn(Outcome<F>, Outcome<F>) -> bool) {
+    let mut random = ChaCha8Rng::seed_from_u64(3);
+    for count in [1, SAMPLES - 1, SAMPLES] {
+        let parameters: Vec<[f64; SAMPLES]> = (0..family.parameters())
+            .map(|_| std::array::from_fn(|_| random.random_range(-3.0..3.0)))
+            .collect();
+        let budgets: Vec<Budget> = (0..count)
+            .map(|i| if i == 0 { budget(1.0) } else { budget(random.random_range(1.0..40.0)) })
+            .collect();
+        for nominal in [false, true] {
+            let stream = |i: usize| ChaCha8Rng::seed_from_u64(i as u64);
+            let mut streams: Vec<ChaCha8Rng> = (0..count).map(stream).collect();
+            let (mut outcomes, mut ratios) = (Vec::new(), vec![0.0; count]);
+            family.draw(Draws {
+                parameters: &parameters,
+                laws: &vec![law; count],
+                budgets: &budgets,
+                random: &mut streams.iter_mut().collect::<Vec<_>>(),
+                nominal,
+                outcomes: &mut outcomes,
+                ratios: &mut ratios,
+            });
+            for i in 0..count {
+                let own: Vec<f64> = parameters.iter().map(|column| column[i]).collect();
+                let perturbation = family.perturbation(&own, &law, budgets[i]);
+                let random = &mut stream(i);
+                let outcome =
+                    if nominal { law.sample(random) } else { perturbation.sample(random) };
+                assert!(close(outcomes[i], outcome), "{:?}, {outcome:?}", outcomes[i]);
+                let ratio = perturbation.likelihood_ratio(outcome);
+                assert!((ratios[i] / ratio - 1.0).abs() < 1e-9, "{}, {ratio}", ratios[i]);
+            }
+        }
+    }
+}
+
+type Outcome<F> = <<F as Family>::Law as Law>::Outcome;
+
+#[test]
+fn draws_in_columns_are_those_of_single_samples() {
+    let law = FiniteLaw { probabilities: [0.0, 0.2, 0.3, 0.5] };
+    check_draws(&FiniteFamily::<4>, law, |a, b| a == b);
+    for count in 1..=MOST {
+        let close = |a: Vector2<f64>, b: Vector2<f64>| (a - b).norm() < 1e-9;
+        check_draws(&GaussianFamily::<Bump>::new(count, 4.0, 50.0), GaussianLaw, close);
+        check_draws(&GaussianFamily::<Probit>::new(count, 4.0, 50.0), GaussianLaw, close);
     }
 }
 

@@ -20,7 +20,6 @@ use super::columns::{exp, ln};
 use super::gaussian::{Component, Gradient, MOST};
 use super::squashed::Squashed;
 use nalgebra::{Matrix2, Vector2};
-use rand::Rng;
 
 /// What zero parameters mean on the diagonal of each bump's L, before squashing: K = L L' has no gradient at
 /// L = 0. A mild round bump first, then narrower ones.
@@ -110,6 +109,7 @@ impl Component for Bump {
     /// Two that are squashed into the disc |c| < `center`, and three that are squashed into a ball of Cholesky
     /// factors L with `||K|| <= ||L||_F^2 < curvature`.
     const PARAMETERS: usize = 5;
+    const UNIFORM: bool = false;
 
     #[inline(always)]
     fn new(parameters: &[f64], index: usize, center: f64, curvature: f64) -> Self {
@@ -146,8 +146,11 @@ impl Component for Bump {
     }
 
     /// m + A z with A A' = S.
-    fn draw<R: Rng>(&self, z: Vector2<f64>, _: &mut R) -> Vector2<f64> {
-        self.mean() + square_root(&self.covariance) * z
+    #[inline(always)]
+    fn draw(&self, z: Vector2<f64>, _: f64) -> Vector2<f64> {
+        let mean = self.covariance.times(self.curvature.times(self.center.value));
+        let [a, b, d] = square_root(&self.covariance);
+        Vector2::new(mean[0] + a * z.x, mean[1] + b * z.x + d * z.y)
     }
 
     /// 1/2 log|I+K|.
@@ -196,9 +199,10 @@ impl Component for Bump {
     }
 }
 
-/// The lower triangular A with A A' = S, of a positive definite S.
-fn square_root(covariance: &Symmetric) -> Matrix2<f64> {
+/// The entries (A11, A21, A22) of the lower triangular A with A A' = S, of a positive definite S.
+#[inline(always)]
+fn square_root(covariance: &Symmetric) -> [f64; 3] {
     let a = covariance.xx.sqrt();
     let b = covariance.xy / a;
-    Matrix2::new(a, 0.0, b, (covariance.yy - b * b).sqrt())
+    [a, b, (covariance.yy - b * b).sqrt()]
 }

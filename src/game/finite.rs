@@ -2,8 +2,8 @@
 //! `M = max_i delta^0_i`, followed by identity mixing.
 
 use crate::game::budget::{Budget, Mixing};
-use crate::game::columns::{self, Loops, SAMPLES, exp, ln};
-use crate::game::perturbation::{Block, Family, Perturbation};
+use crate::game::columns::{self, Column, Loops, SAMPLES, exp, ln};
+use crate::game::perturbation::{Block, Draws, Family, Perturbation};
 use lava_envs::law::{FiniteLaw, sample_index};
 use rand::Rng;
 
@@ -61,27 +61,54 @@ impl<const N: usize> Family for FiniteFamily<N> {
         FinitePerturbation { nominal, base, top, mixing, ratio, perturbed }
     }
 
+    fn draw<R: Rng>(&self, draws: Draws<'_, '_, FiniteLaw<N>, R>) {
+        let Draws { parameters, laws, budgets, random, nominal, outcomes, ratios } = draws;
+        let [mut all, mut probabilities] = [[[0.0; SAMPLES]; N]; 2];
+        columns::widest(Ratios {
+            parameters,
+            laws,
+            budgets,
+            ratios: &mut all,
+            probabilities: &mut probabilities,
+        });
+        for (i, random) in random.iter_mut().enumerate() {
+            let own: [f64; N] = std::array::from_fn(|k| probabilities[k][i]);
+            let drawn_from = if nominal { &laws[i].probabilities } else { &own };
+            let outcome = sample_index(drawn_from, random);
+            outcomes.push(outcome);
+            ratios[i] = all[outcome][i];
+        }
+    }
+
     fn learn(&self, block: Block<'_, FiniteLaw<N>>) {
         columns::widest(Learn(block));
     }
 }
 
-/// [`Family::learn`] in columns: the formulas of [`FinitePerturbation`], each in a loop over the samples.
-struct Learn<'a, const N: usize>(Block<'a, FiniteLaw<N>>);
+/// Perturbations of a block in columns, the formulas of [`FinitePerturbation`] each in a loop over the samples.
+struct Perturbed<const N: usize> {
+    nominal: [Column; N],
+    /// The index of the top.
+    top: Column,
+    /// delta^0.
+    base: [Column; N],
+    /// rho and d rho / d log M.
+    mixing: [Column; 2],
+}
 
-impl<const N: usize> Loops for Learn<'_, N> {
+impl<const N: usize> Perturbed<N> {
     #[inline(always)]
-    fn run(self) {
-        let Block { parameters, given, outcomes, log_ratio, entropy, score, entropy_gradient } =
-            self.0;
-        let (score, entropy_gradient) = (&mut score[..N], &mut entropy_gradient[..N]);
+    fn new<'a>(
+        parameters: &[Column],
+        given: impl Iterator<Item = (&'a FiniteLaw<N>, Budget)>,
+    ) -> Self {
         let mut nominal = [[0.0; SAMPLES]; N];
-        let [mut budget, mut outcome] = [[1.0; SAMPLES]; 2];
-        for (i, ((law, eta), &o)) in given.iter().zip(outcomes).enumerate() {
+        let mut budget = [1.0; SAMPLES];
+        for (i, (law, eta)) in given.enumerate() {
             for (column, probability) in nominal.iter_mut().zip(law.probabilities) {
                 column[i] = probability;
             }
-            (budget[i], outcome[i]) = (eta.get(), o as f64);
+            budget[i] = eta.get();
         }
 
         // The top is the first of the possible outcomes with the largest logit.
@@ -102,22 +129,74 @@ impl<const N: usize> Loops for Learn<'_, N> {
                 sum[i] += nominal[i] * base[i];
             }
         }
-        let [mut rho, mut by_supremum] = [[0.0; SAMPLES]; 2];
+        for (base, nominal) in base.iter_mut().zip(&nominal) {
+            for i in 0..SAMPLES {
+                base[i] = if nominal[i] > 0.0 { base[i] / sum[i] } else { 1.0 };
+            }
+        }
+        let [mut weight, mut by_log_supremum] = [[0.0; SAMPLES]; 2];
         for i in 0..SAMPLES {
             // log M = -log sum.
             let mixing = Mixing::within(budget[i], (1.0 - sum[i]) / sum[i]);
-            (rho[i], by_supremum[i]) = (mixing.weight, mixing.by_log_supremum);
+            (weight[i], by_log_supremum[i]) = (mixing.weight, mixing.by_log_supremum);
         }
+        Perturbed { nominal, top, base, mixing: [weight, by_log_supremum] }
+    }
+
+    #[inline(always)]
+    fn mixing(&self, i: usize) -> Mixing {
+        Mixing { weight: self.mixing[0][i], by_log_supremum: self.mixing[1][i] }
+    }
+}
+
+/// The likelihood ratios of all outcomes in columns, and the perturbed probabilities.
+struct Ratios<'a, const N: usize> {
+    parameters: &'a [Column],
+    laws: &'a [FiniteLaw<N>],
+    budgets: &'a [Budget],
+    ratios: &'a mut [Column; N],
+    probabilities: &'a mut [Column; N],
+}
+
+impl<const N: usize> Loops for Ratios<'_, N> {
+    #[inline(always)]
+    fn run(self) {
+        let Ratios { parameters, laws, budgets, ratios, probabilities } = self;
+        let of = Perturbed::new(parameters, laws.iter().zip(budgets.iter().copied()));
+        for k in 0..N {
+            let (ratio, probability) = (&mut ratios[k], &mut probabilities[k]);
+            let (base, nominal) = (&of.base[k], &of.nominal[k]);
+            for i in 0..SAMPLES {
+                ratio[i] = of.mixing(i).likelihood_ratio(base[i]);
+                probability[i] = nominal[i] * ratio[i];
+            }
+        }
+    }
+}
+
+/// [`Family::learn`] in columns.
+struct Learn<'a, const N: usize>(Block<'a, FiniteLaw<N>>);
+
+impl<const N: usize> Loops for Learn<'_, N> {
+    #[inline(always)]
+    fn run(self) {
+        let Block { parameters, given, outcomes, log_ratio, entropy, score, entropy_gradient } =
+            self.0;
+        let (score, entropy_gradient) = (&mut score[..N], &mut entropy_gradient[..N]);
+        let mut outcome = [0.0; SAMPLES];
+        for (column, &o) in outcome.iter_mut().zip(outcomes) {
+            *column = o as f64;
+        }
+        let of = Perturbed::new(parameters, given.iter().map(|(law, budget)| (law, *budget)));
 
         // What is passed on by delta^0, and by log M, of log delta(o) and of the entropy.
         let [mut through, mut lost_through] = [[0.0; SAMPLES]; 2];
         let [mut at_top, mut lost_at_top] = [[0.0; SAMPLES]; 2];
         for k in 0..N {
-            let (base, nominal) = (&mut base[k], &nominal[k]);
+            let (base, nominal) = (&of.base[k], &of.nominal[k]);
             let (score, lost) = (&mut score[k], &mut entropy_gradient[k]);
             for i in 0..SAMPLES {
-                base[i] = if nominal[i] > 0.0 { base[i] / sum[i] } else { 1.0 };
-                let mixing = Mixing { weight: rho[i], by_log_supremum: by_supremum[i] };
+                let mixing = of.mixing(i);
                 let ratio = mixing.likelihood_ratio(base[i]);
                 let (by_base, by_top) = mixing.derivatives(base[i]);
                 let log = ln(ratio);
@@ -138,10 +217,10 @@ impl<const N: usize> Loops for Learn<'_, N> {
             }
         }
         for k in 0..N {
-            let (base, nominal) = (&base[k], &nominal[k]);
+            let (base, nominal) = (&of.base[k], &of.nominal[k]);
             let (score, lost) = (&mut score[k], &mut entropy_gradient[k]);
             for i in 0..SAMPLES {
-                let is_top = if top[i] == k as f64 { 1.0 } else { 0.0 };
+                let is_top = if of.top[i] == k as f64 { 1.0 } else { 0.0 };
                 let q = nominal[i] * base[i];
                 score[i] += is_top * at_top[i] - through[i] * q;
                 lost[i] += is_top * lost_at_top[i] - lost_through[i] * q;

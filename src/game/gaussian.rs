@@ -8,7 +8,7 @@
 
 use crate::game::budget::{Budget, Mixing};
 use crate::game::columns::{self, Column, Loops, SAMPLES, exp, ln};
-use crate::game::perturbation::{Block, Family, Perturbation};
+use crate::game::perturbation::{Block, Draws, Family, Perturbation};
 use lava_envs::GaussianLaw;
 use nalgebra::Vector2;
 use rand::{Rng, RngExt};
@@ -40,8 +40,11 @@ pub trait Component: Copy + std::fmt::Debug + Send + 'static {
     /// delta^0_j(xi).
     fn likelihood_ratio(&self, xi: Vector2<f64>) -> f64;
 
-    /// A draw from P delta^0_j, made of a standard normal draw z.
-    fn draw<R: Rng>(&self, z: Vector2<f64>, random: &mut R) -> Vector2<f64>;
+    /// Whether a draw needs a uniform number besides.
+    const UNIFORM: bool;
+
+    /// A draw from P delta^0_j, made of a standard normal draw z and a uniform number of [0, 1).
+    fn draw(&self, z: Vector2<f64>, uniform: f64) -> Vector2<f64>;
 
     /// By how much the entropy of P delta^0_j in nats is below that of P, or an upper bound of it.
     fn lost_entropy(&self) -> f64;
@@ -137,8 +140,145 @@ impl<C: Component> Family for GaussianFamily<C> {
         GaussianPerturbation { components, weights, count, supremum: log_supremum.exp(), mixing }
     }
 
+    fn draw<R: Rng>(&self, draws: Draws<'_, '_, GaussianLaw, R>) {
+        let Draws { parameters, budgets, random, nominal, outcomes, ratios, .. } = draws;
+        let mut xi = [[0.0; SAMPLES]; 2];
+        let [mut level, mut uniform, mut ratio] = [[0.5; SAMPLES]; 3];
+        let mut budget = [1.0; SAMPLES];
+        for (i, random) in random.iter_mut().enumerate() {
+            budget[i] = budgets[i].get();
+            if !nominal {
+                level[i] = random.random();
+            }
+            (xi[0][i], xi[1][i]) = (random.sample(StandardNormal), random.sample(StandardNormal));
+            if C::UNIFORM && !nominal {
+                uniform[i] = random.random();
+            }
+        }
+        columns::widest(Reweight {
+            family: self,
+            parameters,
+            budget: &budget,
+            level: &mut level,
+            uniform: &uniform,
+            xi: &mut xi,
+            nominal,
+            ratio: &mut ratio,
+        });
+        let drawn = ratios.len();
+        outcomes.extend((0..drawn).map(|i| Vector2::new(xi[0][i], xi[1][i])));
+        ratios.copy_from_slice(&ratio[..drawn]);
+    }
+
     fn learn(&self, block: Block<'_, GaussianLaw>) {
         columns::widest(Learn { family: self, block });
+    }
+}
+
+/// Where the parameters of component j are.
+#[inline(always)]
+fn own<C: Component>(j: usize) -> std::ops::Range<usize> {
+    C::PARAMETERS * j..C::PARAMETERS * (j + 1)
+}
+
+impl<C: Component> GaussianFamily<C> {
+    /// Component j of sample i, from the columns of its parameters.
+    #[inline(always)]
+    fn component(&self, parameters: &[Column], i: usize, j: usize) -> C {
+        let own: [f64; MOST_PARAMETERS] =
+            std::array::from_fn(|k| if k < C::PARAMETERS { parameters[k][i] } else { 0.0 });
+        C::new(&own[..C::PARAMETERS], j, self.center_bound, self.curvature_bound)
+    }
+
+    /// w = softmax(logits), in columns.
+    #[inline(always)]
+    fn weights(&self, parameters: &[Column]) -> [Column; MOST] {
+        let mut weights = [[1.0; SAMPLES]; MOST];
+        if self.count == 1 {
+            return weights;
+        }
+        let logits = &parameters[C::PARAMETERS * self.count..][..self.count];
+        let mut highest = logits[0];
+        for logit in &logits[1..] {
+            for i in 0..SAMPLES {
+                highest[i] = if logit[i] > highest[i] { logit[i] } else { highest[i] };
+            }
+        }
+        let mut sum = [0.0; SAMPLES];
+        for (weight, logit) in weights.iter_mut().zip(logits) {
+            for i in 0..SAMPLES {
+                weight[i] = exp(logit[i] - highest[i]);
+                sum[i] += weight[i];
+            }
+        }
+        for weight in &mut weights[..self.count] {
+            for i in 0..SAMPLES {
+                weight[i] /= sum[i];
+            }
+        }
+        weights
+    }
+}
+
+/// [`Family::draw`] in columns, from random numbers.
+struct Reweight<'a, C> {
+    family: &'a GaussianFamily<C>,
+    parameters: &'a [Column],
+    budget: &'a Column,
+    /// A uniform number that selects a component or none, and one for it.
+    level: &'a mut Column,
+    uniform: &'a Column,
+    /// A draw of the normal law, turned into one of the perturbed law unless that is to be left out.
+    xi: &'a mut [Column; 2],
+    nominal: bool,
+    /// Receives delta(xi).
+    ratio: &'a mut Column,
+}
+
+impl<C: Component> Loops for Reweight<'_, C> {
+    #[inline(always)]
+    fn run(self) {
+        let Reweight { family, parameters, budget, level, uniform, xi, nominal, ratio } = self;
+        let count = family.count;
+        let weights = family.weights(parameters);
+        let mut supremum = [0.0; SAMPLES];
+        for (j, weight) in weights[..count].iter().enumerate() {
+            let of = &parameters[own::<C>(j)];
+            for i in 0..SAMPLES {
+                supremum[i] += weight[i] * exp(family.component(of, i, j).log_supremum());
+            }
+        }
+        let mut mixings = [Mixing { weight: 1.0, by_log_supremum: 0.0 }; SAMPLES];
+        for i in 0..SAMPLES {
+            mixings[i] = Mixing::within(budget[i], supremum[i] - 1.0);
+        }
+        let [z, w] = *xi;
+        let [x, y] = xi;
+        if !nominal {
+            for (j, weight) in weights[..count].iter().enumerate() {
+                let of = &parameters[own::<C>(j)];
+                for i in 0..SAMPLES {
+                    let drawn =
+                        family.component(of, i, j).draw(Vector2::new(z[i], w[i]), uniform[i]);
+                    let before = level[i];
+                    level[i] -= mixings[i].weight * weight[i];
+                    let selected = (before >= 0.0) & (level[i] < 0.0);
+                    x[i] = if selected { drawn.x } else { x[i] };
+                    y[i] = if selected { drawn.y } else { y[i] };
+                }
+            }
+        }
+        let mut base = [0.0; SAMPLES];
+        for (j, weight) in weights[..count].iter().enumerate() {
+            let of = &parameters[own::<C>(j)];
+            for i in 0..SAMPLES {
+                let component = family.component(of, i, j);
+                base[i] += weight[i] * component.likelihood_ratio(Vector2::new(x[i], y[i]));
+            }
+        }
+        for i in 0..SAMPLES {
+            ratio[i] = mixings[i].likelihood_ratio(base[i]);
+        }
     }
 }
 
@@ -151,16 +291,10 @@ struct Learn<'a, C> {
 impl<C: Component> Loops for Learn<'_, C> {
     #[inline(always)]
     fn run(self) {
-        let Learn { family: &GaussianFamily { count, center_bound, curvature_bound, .. }, block } =
-            self;
+        let Learn { family, block } = self;
+        let count = family.count;
         let Block { parameters, given, outcomes, log_ratio, entropy, score, entropy_gradient } =
             block;
-        let component = |of: &[Column], i: usize, j: usize| {
-            let own: [f64; MOST_PARAMETERS] =
-                std::array::from_fn(|k| if k < C::PARAMETERS { of[k][i] } else { 0.0 });
-            C::new(&own[..C::PARAMETERS], j, center_bound, curvature_bound)
-        };
-        let own = |j: usize| C::PARAMETERS * j..C::PARAMETERS * (j + 1);
         let logits = C::PARAMETERS * count;
 
         let [mut x, mut y, mut budget] = [[0.0; SAMPLES]; 3];
@@ -168,37 +302,16 @@ impl<C: Component> Loops for Learn<'_, C> {
             (x[i], y[i], budget[i]) = (xi.x, xi.y, eta.get());
         }
 
-        // w = softmax(logits).
-        let mut weights = [[1.0; SAMPLES]; MOST];
-        if count > 1 {
-            let mut highest = parameters[logits];
-            for logit in &parameters[logits + 1..logits + count] {
-                for i in 0..SAMPLES {
-                    highest[i] = if logit[i] > highest[i] { logit[i] } else { highest[i] };
-                }
-            }
-            let mut sum = [0.0; SAMPLES];
-            for (weight, logit) in weights.iter_mut().zip(&parameters[logits..logits + count]) {
-                for i in 0..SAMPLES {
-                    weight[i] = exp(logit[i] - highest[i]);
-                    sum[i] += weight[i];
-                }
-            }
-            for weight in &mut weights[..count] {
-                for i in 0..SAMPLES {
-                    weight[i] /= sum[i];
-                }
-            }
-        }
+        let weights = family.weights(parameters);
 
         // M, delta^0(xi) and the lost entropy, in all and of each component.
         let [mut supremum, mut base, mut lost] = [[0.0; SAMPLES]; 3];
         let [mut suprema, mut ratios, mut losts] = [[[0.0; SAMPLES]; MOST]; 3];
         for j in 0..count {
-            let (of, weight) = (&parameters[own(j)], &weights[j]);
+            let (of, weight) = (&parameters[own::<C>(j)], &weights[j]);
             let (own_supremum, ratio, own_lost) = (&mut suprema[j], &mut ratios[j], &mut losts[j]);
             for i in 0..SAMPLES {
-                let component = component(of, i, j);
+                let component = family.component(of, i, j);
                 own_supremum[i] = exp(component.log_supremum());
                 ratio[i] = component.likelihood_ratio(Vector2::new(x[i], y[i]));
                 own_lost[i] = component.lost_entropy();
@@ -226,12 +339,12 @@ impl<C: Component> Loops for Learn<'_, C> {
         let [mut by_log, mut lost_by_log] = [[[0.0; SAMPLES]; MOST]; 2];
         let [mut sum, mut lost_sum] = [[0.0; SAMPLES]; 2];
         for j in 0..count {
-            let (of, weight) = (&parameters[own(j)], &weights[j]);
+            let (of, weight) = (&parameters[own::<C>(j)], &weights[j]);
             let (own_supremum, ratio, own_lost) = (&suprema[j], &ratios[j], &losts[j]);
-            let (score, entropy) = (&mut score[own(j)], &mut entropy_gradient[own(j)]);
+            let (score, entropy) = (&mut score[own::<C>(j)], &mut entropy_gradient[own::<C>(j)]);
             let (by_log, lost_by_log) = (&mut by_log[j], &mut lost_by_log[j]);
             for i in 0..SAMPLES {
-                let component = component(of, i, j);
+                let component = family.component(of, i, j);
                 let share = weight[i] * own_supremum[i];
                 let of_score = Gradient {
                     by_ratio: by_base[i] * weight[i] * ratio[i],
@@ -347,10 +460,11 @@ impl<C: Component> Perturbation for GaussianPerturbation<C> {
     fn sample<R: Rng>(&self, random: &mut R) -> Vector2<f64> {
         let mut level = random.random::<f64>();
         let z = Vector2::new(random.sample(StandardNormal), random.sample(StandardNormal));
+        let uniform = if C::UNIFORM { random.random() } else { 0.5 };
         for (weight, component) in self.components() {
             level -= self.mixing.weight * weight;
             if level < 0.0 {
-                return component.draw(z, random);
+                return component.draw(z, uniform);
             }
         }
         z

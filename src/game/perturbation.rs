@@ -30,6 +30,23 @@ pub trait Family: Clone + std::fmt::Debug {
         budget: Budget,
     ) -> Self::Perturbation;
 
+    /// Draws outcomes of a block of laws. Families override it with columns ([`super::columns`]); this is their
+    /// reference.
+    fn draw<R: Rng>(&self, draws: Draws<'_, '_, Self::Law, R>) {
+        let Draws { parameters, laws, budgets, random, nominal, outcomes, ratios } = draws;
+        let mut own = vec![0.0; self.parameters()];
+        for (i, random) in random.iter_mut().enumerate() {
+            for (own, column) in own.iter_mut().zip(parameters) {
+                *own = column[i];
+            }
+            let perturbation = self.perturbation(&own, &laws[i], budgets[i]);
+            let outcome =
+                if nominal { laws[i].sample(random) } else { perturbation.sample(random) };
+            outcomes.push(outcome);
+            ratios[i] = perturbation.likelihood_ratio(outcome);
+        }
+    }
+
     /// What learning needs of the perturbations of a block of samples. Families override it with columns
     /// ([`super::columns`]); this is their reference.
     fn learn(&self, block: Block<'_, Self::Law>) {
@@ -53,6 +70,24 @@ pub trait Family: Clone + std::fmt::Debug {
             }
         }
     }
+}
+
+/// Perturbations of at most `SAMPLES` laws, of which outcomes are drawn.
+pub struct Draws<'a, 'r, L: Law, R> {
+    /// The family's parameters, a column each.
+    pub parameters: &'a [Column],
+    /// The laws.
+    pub laws: &'a [L],
+    /// The budgets.
+    pub budgets: &'a [Budget],
+    /// What to draw with, one for each law.
+    pub random: &'a mut [&'r mut R],
+    /// Whether to draw from P instead of P delta.
+    pub nominal: bool,
+    /// Receives the outcomes o.
+    pub outcomes: &'a mut Vec<L::Outcome>,
+    /// Receives delta(o).
+    pub ratios: &'a mut [f64],
 }
 
 /// What learning needs of the perturbations of at most `SAMPLES` samples.

@@ -19,7 +19,6 @@ use super::gaussian::{Component, Gradient, MOST};
 use super::normal::{below, density, quantile};
 use super::squashed::Squashed;
 use nalgebra::Vector2;
-use rand::{Rng, RngExt};
 
 /// What zero parameters mean for each step's a, before squashing: as likely as not first, then rarer.
 const NEUTRAL: [f64; MOST] = [0.0, 0.25, 0.5];
@@ -61,6 +60,7 @@ impl Component for Probit {
     /// Two that are squashed into the disc |w|^2 < `curvature`, and one that is squashed into |a| < `center`
     /// (at most 30).
     const PARAMETERS: usize = 3;
+    const UNIFORM: bool = true;
 
     fn new(parameters: &[f64], index: usize, center: f64, curvature: f64) -> Self {
         let slope = Squashed::new([parameters[0], parameters[1]], curvature.sqrt());
@@ -78,9 +78,9 @@ impl Component for Probit {
         below(self.argument(xi)) / self.mass
     }
 
-    fn draw<R: Rng>(&self, z: Vector2<f64>, random: &mut R) -> Vector2<f64> {
+    fn draw(&self, z: Vector2<f64>, uniform: f64) -> Vector2<f64> {
         // T > a: with u uniform in (0, 1], Phi(-T) = u Phi(-a).
-        let beyond = (1.0 - random.random::<f64>()) * self.mass;
+        let beyond = (1.0 - uniform) * self.mass;
         let t = -quantile(beyond);
         // z with its part along w shrunk by 1/s has the covariance I - w w'/s^2.
         let (w, s) = (self.slope(), self.scale);

@@ -18,14 +18,16 @@ use super::state::{PlayerState, Unfit};
 use super::trajectories::Trajectories;
 use crate::game::budget::Budget;
 use crate::game::bump::Bump;
+use crate::game::columns::SAMPLES;
 use crate::game::finite::FiniteFamily;
 use crate::game::gaussian::GaussianFamily;
-use crate::game::perturbation::{Family, Perturbation};
+use crate::game::perturbation::{Draws, Family, Perturbation};
 use crate::game::probit::Probit;
 use lava_envs::random::ChaCha8Rng;
 use lava_envs::{FiniteLaw, GaussianLaw, Law};
 use rand::RngExt;
 use rand_distr::StandardNormal;
+use smallvec::SmallVec;
 use std::fmt::Debug;
 
 /// What an antagonist records: the nominal law and the budget it acted within, and the outcome.
@@ -246,28 +248,41 @@ impl<F: Family + Send + 'static> Antagonist<F::Law> for Player<AntagonistHead<F>
     }
 
     fn reweight(&self, of: Reweighting<'_, F::Law>) {
-        let mut parameters = Vec::new();
+        let Reweighting { outputs, laws, budgets, draw, streams, stream, outcomes, ratios, .. } =
+            of;
+        let (slots, count) = (laws.len(), self.head.outputs());
+        let mut parameters = vec![[0.0; SAMPLES]; count];
         let mut error: f64 = 0.0;
-        for (slot, (law, &budget)) in of.laws.iter().zip(of.budgets).enumerate() {
-            let random = (of.stream)(&mut of.streams[slot]);
-            match of.outputs {
-                Some(outputs) => self.parameters_in(outputs, slot, &mut parameters),
+        for (start, streams) in (0..slots).step_by(SAMPLES).zip(streams.chunks_mut(SAMPLES)) {
+            let mut random: SmallVec<[&mut ChaCha8Rng; SAMPLES]> =
+                streams.iter_mut().map(stream).collect();
+            let block = start..start + random.len();
+            match outputs {
+                Some(outputs) => self.columns_in(outputs, block.clone(), &mut parameters),
                 None => {
-                    parameters.clear();
-                    let count = self.head.outputs();
-                    parameters.extend((0..count).map(|_| random.sample::<f64, _>(StandardNormal)));
+                    for column in &mut parameters {
+                        let draws = random.iter_mut().map(|random| random.sample(StandardNormal));
+                        column.iter_mut().zip(draws).for_each(|(to, from)| *to = from);
+                    }
                 }
             }
-            let perturbation = self.head.0.perturbation(&parameters, law, budget);
             if of.normalisation_error.is_some() {
-                error = error.max(perturbation.normalisation_error());
+                let mut own = vec![0.0; count];
+                for (i, slot) in block.clone().enumerate() {
+                    own.iter_mut().zip(&parameters).for_each(|(to, column)| *to = column[i]);
+                    let perturbation = self.head.0.perturbation(&own, &laws[slot], budgets[slot]);
+                    error = error.max(perturbation.normalisation_error());
+                }
             }
-            let outcome = match of.draw {
-                Draw::Nominal => law.sample(random),
-                Draw::Perturbed => perturbation.sample(random),
-            };
-            of.outcomes.push(outcome);
-            of.ratios[slot] = perturbation.likelihood_ratio(outcome);
+            self.head.0.draw(Draws {
+                parameters: &parameters,
+                laws: &laws[block.clone()],
+                budgets: &budgets[block.clone()],
+                random: &mut random,
+                nominal: draw == Draw::Nominal,
+                outcomes,
+                ratios: &mut ratios[block],
+            });
         }
         if let Some(largest) = of.normalisation_error {
             *largest = largest.max(error);
@@ -302,17 +317,20 @@ impl<F: Family + Send + 'static> Antagonist<F::Law> for Player<AntagonistHead<F>
         let [during, after] = inputs.rows().split_at(steps, width);
         self.network.values(after, &mut richer);
         self.network.act(during, &mut outputs);
-        let mut parameters = Vec::new();
-        let elasticity = |i: usize| {
-            self.parameters_in(&outputs, i, &mut parameters);
-            let (law, budget) = played.given[i];
-            let budget = Budget::remaining(budget.get() * STEP.exp()).unwrap_or(budget);
-            let log = self.head.log_probability(&parameters, &(law, budget), &played.choices[i]);
-            (((log - played.log_probabilities[i]) / STEP) as f32).clamp(-largest, largest)
-        };
+        let with_more: Vec<_> = played
+            .given
+            .iter()
+            .map(|&(law, budget)| {
+                (law, Budget::remaining(budget.get() * STEP.exp()).unwrap_or(budget))
+            })
+            .collect();
+        let mut logs = Vec::with_capacity(steps);
+        self.log_probabilities(&outputs, &with_more, &played.choices, &mut logs);
+        let elasticity =
+            |(log, own): (&f64, &f64)| (((log - own) / STEP) as f32).clamp(-largest, largest);
         let slope = |(richer, value): (&f32, &f32)| (richer - value) / STEP as f32;
         BudgetSensitivity {
-            elasticities: (0..steps).map(elasticity).collect(),
+            elasticities: logs.iter().zip(&played.log_probabilities).map(elasticity).collect(),
             last: richer.iter().zip(&values).map(slope).collect(),
         }
     }

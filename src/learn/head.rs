@@ -12,7 +12,7 @@ use crate::game::columns::{self, Column, Loops, SAMPLES, exp, ln};
 use crate::game::perturbation::{self, Family, Perturbation};
 use lava_envs::Force;
 use lava_envs::action::{Action, ActionKind, Discrete, Finite};
-use lava_envs::law::{FiniteLaw, GaussianLaw, Law};
+use lava_envs::law::{FiniteLaw, GaussianLaw, Law, sample_index};
 use nalgebra::Vector2;
 use rand::Rng;
 use smallvec::SmallVec;
@@ -55,8 +55,23 @@ pub trait Head: Clone + std::fmt::Debug {
         entropy_gradient: &mut [f64],
     ) -> (f64, f64);
 
-    /// The same for a block of samples. Heads override it with columns ([`crate::game::columns`]); this is
-    /// their reference.
+    /// log-probabilities of the choices of a block of samples, at most `SAMPLES`. Heads override it with columns.
+    fn log_probabilities(
+        &self,
+        parameters: &[Column],
+        given: &[Self::Given],
+        choices: &[Self::Choice],
+        log_probability: &mut Column,
+    ) {
+        let mut own = vec![0.0; parameters.len()];
+        for (i, (given, choice)) in given.iter().zip(choices).enumerate() {
+            own.iter_mut().zip(parameters).for_each(|(own, column)| *own = column[i]);
+            log_probability[i] = self.log_probability(&own, given, choice);
+        }
+    }
+
+    /// [`Head::gradients`] of a block of samples. Heads override it with columns ([`crate::game::columns`]); this
+    /// is their reference.
     fn gradients_of_block(&self, block: Block<'_, Self>) {
         let Block { parameters, given, choices, .. } = block;
         let count = parameters.len();
@@ -122,6 +137,21 @@ pub trait PolicyHead: Head<Given = ()> {
             Mode::Greedy => self.greedy(parameters),
             Mode::Sampled => self.draw(parameters, random),
         }
+    }
+
+    /// The actions of a block of samples, one for each random stream. Heads override it with columns.
+    fn choose_block<'a, R: Rng + 'a>(
+        &self,
+        parameters: &[Column],
+        mode: Mode,
+        random: impl Iterator<Item = &'a mut R>,
+        actions: &mut Vec<Self::Choice>,
+    ) {
+        let mut own = vec![0.0; parameters.len()];
+        actions.extend(random.enumerate().map(|(i, random)| {
+            own.iter_mut().zip(parameters).for_each(|(own, column)| *own = column[i]);
+            self.choose(&own, mode, random)
+        }));
     }
 }
 
@@ -239,9 +269,69 @@ impl<A: Discrete, const N: usize> Head for CategoricalPolicy<A, N> {
         (log_probability, entropy)
     }
 
+    fn log_probabilities(
+        &self,
+        logits: &[Column],
+        _: &[()],
+        choices: &[A],
+        log_probability: &mut Column,
+    ) {
+        let mut logs: [Column; N] = [[0.0; SAMPLES]; N];
+        columns::widest(LogSoftmax { logits, logs: &mut logs, exponentials: false });
+        for (i, choice) in choices.iter().enumerate() {
+            log_probability[i] = logs[choice.index()][i];
+        }
+    }
+
     fn gradients_of_block(&self, block: Block<'_, Self>) {
         columns::widest(CategoricalBlock(block));
     }
+}
+
+/// The logarithms of a softmax, or the softmax, in columns.
+struct LogSoftmax<'a> {
+    logits: &'a [Column],
+    logs: &'a mut [Column],
+    exponentials: bool,
+}
+
+impl Loops for LogSoftmax<'_> {
+    #[inline(always)]
+    fn run(self) {
+        let LogSoftmax { logits, logs, exponentials } = self;
+        let shift = log_sum(logits);
+        for (log, logit) in logs.iter_mut().zip(logits) {
+            for i in 0..SAMPLES {
+                log[i] = logit[i] - shift[i];
+            }
+            if exponentials {
+                for entry in log.iter_mut() {
+                    *entry = exp(*entry);
+                }
+            }
+        }
+    }
+}
+
+/// log sum_k exp(logit_k).
+#[inline(always)]
+fn log_sum(logits: &[Column]) -> Column {
+    let mut highest = logits[0];
+    for logit in &logits[1..] {
+        for i in 0..SAMPLES {
+            highest[i] = if logit[i] > highest[i] { logit[i] } else { highest[i] };
+        }
+    }
+    let mut sum = [0.0; SAMPLES];
+    for logit in logits {
+        for i in 0..SAMPLES {
+            sum[i] += exp(logit[i] - highest[i]);
+        }
+    }
+    for i in 0..SAMPLES {
+        sum[i] = highest[i] + ln(sum[i]);
+    }
+    sum
 }
 
 struct CategoricalBlock<'a, A: Discrete, const N: usize>(Block<'a, CategoricalPolicy<A, N>>);
@@ -256,22 +346,8 @@ impl<A: Discrete, const N: usize> Loops for CategoricalBlock<'_, A, N> {
         for (column, chosen) in choice.iter_mut().zip(choices) {
             *column = chosen.index() as f64;
         }
-        let mut shift = parameters[0];
-        for logit in &parameters[1..] {
-            for i in 0..SAMPLES {
-                shift[i] = if logit[i] > shift[i] { logit[i] } else { shift[i] };
-            }
-        }
-        let mut sum = [0.0; SAMPLES];
-        for logit in parameters {
-            for i in 0..SAMPLES {
-                sum[i] += exp(logit[i] - shift[i]);
-            }
-        }
-        for i in 0..SAMPLES {
-            shift[i] += ln(sum[i]);
-            entropy[i] = 0.0;
-        }
+        let shift = log_sum(parameters);
+        entropy.fill(0.0);
         for (k, logit) in parameters.iter().enumerate() {
             let (score, log) = (&mut score[k], &mut entropy_gradient[k]);
             for i in 0..SAMPLES {
@@ -307,6 +383,29 @@ impl<A: Discrete, const N: usize> PolicyHead for CategoricalPolicy<A, N> {
     fn greedy(&self, logits: &[f64]) -> A {
         let best = (1..A::COUNT).fold(0, |best, i| if logits[i] > logits[best] { i } else { best });
         A::from_index(best)
+    }
+
+    fn choose_block<'a, R: Rng + 'a>(
+        &self,
+        logits: &[Column],
+        mode: Mode,
+        random: impl Iterator<Item = &'a mut R>,
+        actions: &mut Vec<A>,
+    ) {
+        let mut probabilities: [Column; N] = [[0.0; SAMPLES]; N];
+        if mode == Mode::Sampled {
+            let logs = &mut probabilities;
+            columns::widest(LogSoftmax { logits, logs, exponentials: true });
+        }
+        actions.extend(random.enumerate().map(|(i, random)| match mode {
+            Mode::Greedy => {
+                self.greedy(&std::array::from_fn::<_, N, _>(|action| logits[action][i]))
+            }
+            Mode::Sampled => {
+                let own: [f64; N] = std::array::from_fn(|action| probabilities[action][i]);
+                A::from_index(sample_index(&own, random))
+            }
+        }));
     }
 
     fn probabilities(&self, logits: &[f64], probabilities: &mut Vec<f64>) -> bool {
@@ -461,6 +560,26 @@ impl<F: Family> Head for AntagonistHead<F> {
         let ratio = perturbation.score(*outcome, score);
         let entropy = perturbation.entropy(entropy_gradient);
         (law.log_density(*outcome) + ratio.ln(), entropy)
+    }
+
+    fn log_probabilities(
+        &self,
+        parameters: &[Column],
+        given: &[Self::Given],
+        choices: &[Self::Choice],
+        log_probability: &mut Column,
+    ) {
+        let none = [0.0; SAMPLES];
+        let [mut score, mut entropy_gradient] = [(); 2].map(|()| vec![none; parameters.len()]);
+        self.gradients_of_block(Block {
+            parameters,
+            given,
+            choices,
+            log_probability,
+            entropy: &mut none.clone(),
+            score: &mut score,
+            entropy_gradient: &mut entropy_gradient,
+        });
     }
 
     fn gradients_of_block(&self, block: Block<'_, Self>) {

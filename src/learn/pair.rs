@@ -13,6 +13,7 @@ use super::policy::{
 };
 use super::ppo::Player;
 use super::weights::{self, Weights, WeightsError};
+use crate::game::columns::{Column, SAMPLES};
 use lava_envs::random::{Purpose, stream};
 use lava_envs::{Action, Law, World};
 
@@ -142,13 +143,14 @@ pub struct PpoPolicy<'a, H: PolicyHead> {
     /// The outputs of its actor for it, shape `[k, slots]`.
     pub outputs: Vec<f32>,
     parameters: Vec<f64>,
+    columns: Vec<Column>,
 }
 
 impl<'a, H: PolicyHead> PpoPolicy<'a, H> {
     /// The policy of a player.
     pub fn new(player: &'a Player<H>, observation: Observation) -> Self {
-        let (inputs, outputs, parameters) = Default::default();
-        PpoPolicy { player, observation, inputs, outputs, parameters }
+        let (inputs, outputs, parameters, columns) = Default::default();
+        PpoPolicy { player, observation, inputs, outputs, parameters, columns }
     }
 
     /// Lets the actor see the world.
@@ -157,10 +159,10 @@ impl<'a, H: PolicyHead> PpoPolicy<'a, H> {
         self.player.network.act(self.inputs.rows(), &mut self.outputs);
     }
 
-    /// log-probability of a choice in a slot of the last step.
-    pub fn log_probability(&mut self, slot: usize, choice: &H::Choice) -> f64 {
-        self.player.parameters_in(&self.outputs, slot, &mut self.parameters);
-        self.player.head.log_probability(&self.parameters, &(), choice)
+    /// Appends the log-probabilities of choices in the slots of the last step.
+    pub fn log_probabilities(&self, choices: &[H::Choice], log_probabilities: &mut Vec<f64>) {
+        let given = vec![(); choices.len()];
+        self.player.log_probabilities(&self.outputs, &given, choices, log_probabilities);
     }
 }
 
@@ -200,11 +202,13 @@ where
         actions: &mut Vec<W::Action>,
     ) {
         self.look(world);
-        let PpoPolicy { player, outputs, parameters, .. } = self;
-        actions.extend(streams.iter_mut().enumerate().map(|(slot, streams)| {
-            player.parameters_in(outputs, slot, parameters);
-            player.head.choose(parameters, mode, &mut streams.actions)
-        }));
+        let PpoPolicy { player, outputs, columns, .. } = self;
+        let slots = streams.len();
+        for (start, streams) in (0..slots).step_by(SAMPLES).zip(streams.chunks_mut(SAMPLES)) {
+            player.columns_in(outputs, start..start + streams.len(), columns);
+            let random = streams.iter_mut().map(|of| &mut of.actions);
+            player.head.choose_block(columns, mode, random, actions);
+        }
     }
 
     fn probabilities(&mut self, world: &W) -> Option<Vec<f64>> {

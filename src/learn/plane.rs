@@ -15,6 +15,7 @@
 use super::head::{Block, GaussianPolicy, Head, HeadOf, PolicyHead};
 use super::options::{PlaneLaw, TrainOptions};
 use super::truncated_normal::TruncatedNormal;
+use crate::game::columns::Column;
 use lava_envs::action::Plane;
 use lava_envs::{Force, GaussianLaw};
 use nalgebra::Vector2;
@@ -232,6 +233,18 @@ impl Head for PlanePolicy {
         entropy_gradient: &mut [f64],
     ) -> (f64, f64) {
         selected!(self, head => head.gradients(parameters, given, choice, score, entropy_gradient))
+    }
+
+    fn log_probabilities(
+        &self,
+        parameters: &[Column],
+        given: &[()],
+        choices: &[Force],
+        log_probability: &mut Column,
+    ) {
+        selected!(self, head => {
+            head.log_probabilities(parameters, given, choices, log_probability);
+        });
     }
 
     fn gradients_of_block(&self, block: Block<'_, Self>) {

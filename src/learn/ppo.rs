@@ -23,6 +23,7 @@ use crate::learn::state::{PlayerState, Unfit};
 use crate::learn::trajectories::Trajectories;
 use lava_envs::random::ChaCha8Rng;
 use rand::seq::SliceRandom;
+use std::ops::Range;
 
 /// A player: the head that gives its outputs a meaning, its networks and its optimiser.
 #[derive(Debug)]
@@ -212,6 +213,40 @@ impl<H: Head> Player<H> {
         }
         for (parameter, &constant) in constants.iter_mut().zip(self.network.constants()) {
             *parameter = f64::from(constant);
+        }
+    }
+
+    /// Writes the parameters of the head in a block of at most `SAMPLES` slots, a column each: the actor's
+    /// outputs there, of shape `[k, slots]`, and the head's constants.
+    pub fn columns_in(&self, outputs: &[f32], block: Range<usize>, columns: &mut Vec<Column>) {
+        let shape = self.network.shape();
+        let slots = outputs.len() / shape.outputs;
+        columns.resize(shape.outputs + shape.constants, [0.0; SAMPLES]);
+        let (own, constants) = columns.split_at_mut(shape.outputs);
+        for (column, row) in own.iter_mut().zip(outputs.chunks_exact(slots)) {
+            column.iter_mut().zip(&row[block.clone()]).for_each(|(to, &from)| *to = from.into());
+        }
+        for (column, &constant) in constants.iter_mut().zip(self.network.constants()) {
+            column.fill(constant.into());
+        }
+    }
+
+    /// log-probabilities of choices, from outputs of the actor of shape `[k, slots]`, appended to
+    /// `log_probabilities`.
+    pub fn log_probabilities(
+        &self,
+        outputs: &[f32],
+        given: &[H::Given],
+        choices: &[H::Choice],
+        log_probabilities: &mut Vec<f64>,
+    ) {
+        let (mut columns, mut column) = (Vec::new(), [0.0; SAMPLES]);
+        for start in (0..choices.len()).step_by(SAMPLES) {
+            let block = start..choices.len().min(start + SAMPLES);
+            self.columns_in(outputs, block.clone(), &mut columns);
+            let (given, choices) = (&given[block.clone()], &choices[block]);
+            self.head.log_probabilities(&columns, given, choices, &mut column);
+            log_probabilities.extend_from_slice(&column[..choices.len()]);
         }
     }
 

@@ -106,7 +106,7 @@ impl<W: Arena> Collector<W> {
                 None => &mut Nominal,
             };
             self.game.step(&mut policy, terms.mode, chance, Draw::Perturbed);
-            self.record_protagonist(&mut policy, pair.observation, options.credit);
+            self.record_protagonist(&policy, pair.observation, options.credit);
             if let Some(opponent) = &opponent {
                 self.record_antagonist(opponent);
                 self.record_draws(opponent);
@@ -145,7 +145,7 @@ impl<W: Arena> Collector<W> {
 
     fn record_protagonist(
         &mut self,
-        policy: &mut PpoPolicy<'_, super::pair::HeadIn<W>>,
+        policy: &PpoPolicy<'_, super::pair::HeadIn<W>>,
         observation: Observation,
         credit: Credit,
     ) {
@@ -159,10 +159,11 @@ impl<W: Arena> Collector<W> {
             .unwrap_or(game.actions[slot]);
             record.given.push(());
             record.choices.push(choice);
-            record.log_probabilities.push(policy.log_probability(slot, &choice));
             record.rewards.push(game.steps[slot].reward as f32);
             record.ended.push(game.steps[slot].end.is_some());
         }
+        let chosen = record.choices.len() - game.slots();
+        policy.log_probabilities(&record.choices[chosen..], &mut record.log_probabilities);
     }
 
     /// Records what the protagonist saw, and its critic besides.
