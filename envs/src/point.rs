@@ -92,8 +92,8 @@ pub struct LavaPoint {
 }
 
 impl LavaPoint {
-    /// The same world with every substep of every body in Rapier, free flight included. Bit for bit
-    /// equal and slower; for tests and benchmarks.
+    /// The same world with every substep of every body in Rapier. Bit for bit equal and slower; for tests and
+    /// benchmarks.
     ///
     /// # Errors
     /// If a value of the configuration is out of range.

@@ -328,15 +328,28 @@ fn the_substep_does_not_decide_the_return() {
     assert!(change.abs() < error, "{change} with a standard error of {error}");
 }
 
-/// Free flight outside Rapier is Rapier's, bit for bit, along whole episodes.
+/// Free flight and walls outside Rapier are Rapier's, bit for bit, along whole episodes.
 #[test]
-fn free_flight_is_rapiers_bit_for_bit() {
-    let config = PointConfig::default();
-    let mut fast = LavaPoint::new(&config, 200).unwrap();
-    let mut rapier = LavaPoint::by_rapier_alone(&config, 200).unwrap();
+fn motion_is_rapiers_bit_for_bit() {
+    check_motion(&PointConfig::default(), 400);
+    check_motion(&PointConfig { noise: 4.0, ..PointConfig::default() }, 100);
+    let other = PointConfig {
+        arena: [11.3, 6.7],
+        mass: 2.7,
+        radius: 0.23,
+        substeps: 3,
+        control_step: 0.13,
+        ..PointConfig::default()
+    };
+    check_motion(&other, 200);
+}
+
+fn check_motion(config: &PointConfig, times: u32) {
+    let mut fast = LavaPoint::new(config, 200).unwrap();
+    let mut rapier = LavaPoint::by_rapier_alone(config, 200).unwrap();
     let mut random = stream(6, Purpose::Outcomes, 0);
     let (mut steps, mut same) = (vec![Step::IDLE; 200], vec![Step::IDLE; 200]);
-    for time in 0..400 {
+    for time in 0..times {
         let (actions, outcomes): (Vec<_>, Vec<_>) = (0..200)
             .map(|slot| {
                 let planned = planned(&fast, slot);

@@ -1,4 +1,4 @@
-//! Motion between walls: Rapier where a wall may be touched, Rapier's own arithmetic where not.
+//! Motion between walls, in Rapier's own arithmetic and by Rapier.
 //!
 //! A substep of length h = tau/n is, in free flight,
 //!
@@ -28,9 +28,10 @@
 //! contact is therefore solved only if the straight path of this substep leads to its wall
 //! (`Paths`). With that the motion is that of a point clamped to the arena, to rounding (tested).
 //!
-//! # Why free flight is separate
-//! A disc whose path leads to no wall has no contact to solve. Its two lines of arithmetic are done
-//! here in Rapier's order and precision, which gives the same bits (tested) in a fraction of the time.
+//! # Why Rapier hardly works
+//! A disc whose path leads to no wall has no contact to solve, and one that meets a wall has a contact on one axis
+//! alone. Both are done here in Rapier's order and precision ([`Contact`]), which gives the same bits (tested) in a
+//! fraction of the time. Rapier itself moves what is faster than its speed limit, and is the reference.
 
 use super::config::PointConfig;
 use super::vector;
@@ -95,9 +96,63 @@ impl Paths {
             _ => unreachable!("there are four walls"),
         }
     }
+}
 
-    fn leads_nowhere(&self, body: Body) -> bool {
-        (0..4).all(|wall| !self.leads_to(body, wall))
+/// What Rapier does at a wall, along the axis of its normal.
+#[derive(Debug, Clone, Copy)]
+struct Contact {
+    dt: f32,
+    inverse_dt: f32,
+    radius: f32,
+    inverse_mass: f32,
+    mass: f32,
+    /// Of overlaps: rate of their removal, its largest speed, and the share of the impulse that is applied.
+    softness: [f32; 3],
+    walls: [Wall; 4],
+}
+
+/// A wall, a cuboid, along the axis of its normal.
+#[derive(Debug, Clone, Copy)]
+struct Wall {
+    /// Direction of the normal, out of the wall.
+    normal: f32,
+    /// Coordinate of the cuboid's centre.
+    centre: f32,
+    /// Half of its width.
+    half: f32,
+}
+
+impl Contact {
+    /// Position and velocity after a substep, before damping, along the axis of the wall that the path leads to.
+    /// Names are Rapier's; every rounding is its own.
+    fn solve(&self, wall: usize, x: f32, v: f32) -> (f32, f32) {
+        let Contact { dt, inverse_dt, radius, inverse_mass, mass, softness, .. } = *self;
+        let [erp_inv_dt, max_corrective_velocity, cfm_factor] = softness;
+        let Wall { normal, centre, half } = self.walls[wall];
+        // The narrow phase: the disc in the cuboid's frame, projected onto its face.
+        let projection = normal * half;
+        let depth = normal * ((x - centre) - projection) - radius;
+        let (on_wall, on_disc) = (projection + centre, x + -(normal * radius));
+        let shift = normal * (on_disc - on_wall) - depth;
+        let anchor = on_wall + normal * shift;
+        let point = (anchor + on_disc) * 0.5;
+        // The constraint, relative to lever arms that end in the middle of both points.
+        let arm = x + (point - x);
+        let local = arm - x;
+        let dist = normal * ((x + (on_disc - x)) - anchor) - normal * (arm - point);
+        let dist_at = |x: f32| dist + normal * ((x + local) - point);
+        // With bias, then the step, then without bias.
+        let before = dist_at(x);
+        let bias = (before * erp_inv_dt).clamp(-max_corrective_velocity, 0.0);
+        let towards = normal * v;
+        let relative = towards + (before.max(0.0) * inverse_dt + bias);
+        let factor = if before <= 0.0 { cfm_factor } else { 1.0 };
+        let impulse = factor * (-(mass * relative)).max(0.0);
+        let v = v + normal * inverse_mass * impulse;
+        let x = x + v * dt;
+        let relative = normal * v + dist_at(x).max(0.0) * inverse_dt;
+        let relaxed = (impulse - mass * relative).max(0.0);
+        (x, v + normal * inverse_mass * (relaxed - impulse))
     }
 }
 
@@ -123,14 +178,15 @@ impl PhysicsHooks for Paths {
 pub struct Physics {
     world: PhysicsWorld,
     seats: Vec<RigidBodyHandle>,
-    free_flight: bool,
+    all_by_rapier: bool,
     paths: Paths,
+    contact: Contact,
     /// Share of the velocity that remains after a substep, as Rapier computes it.
     retention: f32,
     /// Just below Rapier's own limit, whose comparison rounds differently.
     speed_limit: f32,
-    /// Work space: the slots that may touch a wall in this substep.
-    touching: Vec<usize>,
+    /// Work space: the slots that Rapier moves in this substep.
+    seated: Vec<usize>,
 }
 
 impl Physics {
@@ -196,39 +252,65 @@ impl Physics {
             })
             .collect();
         let margin = Vector::splat(config.radius as f32);
+        let parameters = &world.integration_parameters;
+        let (soft, rigid) = (parameters.contact_softness, parameters.static_contact_softness);
+        // Rapier blends the softness of moving bodies with that of fixed ones.
+        let blended = |of: fn(&SpringCoefficients<f32>, f32) -> f32| {
+            let (soft, rigid) = (of(&soft, dt), of(&rigid, dt));
+            soft + (rigid - soft)
+        };
+        let inverse_mass = 1.0 / config.mass as f32;
+        let wall = |normal: f32, centre: f32| Wall { normal, centre, half: thickness };
+        let contact = Contact {
+            dt,
+            inverse_dt: parameters.inv_dt(),
+            radius: config.radius as f32,
+            inverse_mass,
+            mass: 1.0 / inverse_mass,
+            softness: [
+                blended(SpringCoefficients::erp_inv_dt),
+                parameters.max_corrective_velocity(),
+                blended(SpringCoefficients::cfm_factor),
+            ],
+            walls: [
+                wall(1.0, -thickness),
+                wall(-1.0, width + thickness),
+                wall(1.0, -thickness),
+                wall(-1.0, height + thickness),
+            ],
+        };
         Physics {
             world,
             seats,
-            free_flight: true,
+            all_by_rapier: false,
             paths: Paths { dt, min: margin, max: Vector::new(width, height) - margin },
+            contact,
             retention: 1.0 / (1.0 + dt * damping),
             speed_limit: speed_limit * 0.999,
-            touching: Vec::new(),
+            seated: Vec::new(),
         }
     }
 
-    /// From now on Rapier also moves the bodies that meet no wall.
+    /// From now on Rapier moves all bodies.
     pub fn give_all_to_rapier(&mut self) {
-        self.free_flight = false;
+        self.all_by_rapier = true;
     }
 
     /// Moves the bodies of the listed slots by one substep.
     pub fn substep(&mut self, bodies: &mut [Body], moving: &[usize]) {
-        self.touching.clear();
+        self.seated.clear();
         for &slot in moving {
             let body = &mut bodies[slot];
-            if self.free_flight
-                && self.paths.leads_nowhere(*body)
-                && body.velocity.length_squared() < self.speed_limit * self.speed_limit
-            {
-                body.position = self.paths.end(*body);
-                // Rapier adds its (absent) forces, which turns -0 into 0.
-                body.velocity = (body.velocity + Vector::ZERO) * self.retention;
+            let fast = body.velocity.length_squared() >= self.speed_limit * self.speed_limit;
+            if fast || self.all_by_rapier {
+                self.seated.push(slot);
             } else {
-                self.touching.push(slot);
+                let Body { position, velocity } = self.moved(*body);
+                // Rapier adds its (absent) forces, which turns -0 into 0.
+                *body = Body { position, velocity: (velocity + Vector::ZERO) * self.retention };
             }
         }
-        for group in self.touching.chunks(self.seats.len()) {
+        for group in self.seated.chunks(self.seats.len()) {
             for (&slot, &seat) in group.iter().zip(&self.seats) {
                 let rigid = &mut self.world.bodies[seat];
                 rigid.set_translation(bodies[slot].position, false);
@@ -240,5 +322,22 @@ impl Physics {
                 bodies[slot] = Body { position: rigid.translation(), velocity: rigid.linvel() };
             }
         }
+    }
+
+    /// A body after a substep, before damping.
+    fn moved(&self, body: Body) -> Body {
+        let Body { position, velocity } = body;
+        let mut moved = Body { position: self.paths.end(body), velocity };
+        let walls =
+            |a: usize, b: usize| [a, b].into_iter().find(|&wall| self.paths.leads_to(body, wall));
+        if let Some(wall) = walls(0, 1) {
+            let (x, v) = self.contact.solve(wall, position.x, velocity.x);
+            (moved.position.x, moved.velocity.x) = (x, v);
+        }
+        if let Some(wall) = walls(2, 3) {
+            let (y, v) = self.contact.solve(wall, position.y, velocity.y);
+            (moved.position.y, moved.velocity.y) = (y, v);
+        }
+        moved
     }
 }
