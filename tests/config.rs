@@ -253,7 +253,9 @@ fn shipped(name: &str) -> Config {
 
 #[test]
 fn the_shipped_configurations_are_valid() {
-    for (name, runs) in [("quick", 18), ("paper", 60), ("paper-plain", 60), ("ablations", 220)] {
+    let paper = [("paper", 120), ("paper-timeless", 60), ("paper-plain", 60)];
+    let earlier = [("coordinates", 60), ("ablations", 220)];
+    for (name, runs) in [("quick", 18)].into_iter().chain(paper).chain(earlier) {
         let config = shipped(name);
         assert_eq!(plan::runs(&config).len(), runs, "{name}");
     }
@@ -544,7 +546,7 @@ fn committed(folder: &str) -> Vec<RunConfig> {
 
 #[test]
 fn committed_runs_are_those_of_the_shipped_configurations() {
-    for name in ["paper", "paper-plain", "ablations"] {
+    for name in ["paper", "paper-timeless", "paper-plain", "coordinates", "ablations"] {
         let config = shipped(name);
         let mut planned = plan::runs(&config);
         for run in committed(name) {

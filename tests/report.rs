@@ -737,7 +737,8 @@ fn a_bomb_in_an_archive_is_refused() {
 #[test]
 fn committed_results_make_their_tables_again() {
     let results = Path::new(env!("CARGO_MANIFEST_DIR")).join("results");
-    for sweep in ["paper", "paper-plain", "paper-held-out", "ablations"] {
+    let paper = ["paper", "paper-timeless", "paper-plain"];
+    for sweep in paper.iter().chain(&["coordinates", "coordinates-held-out", "ablations"]) {
         let dir = tempfile::tempdir().unwrap();
         let (from, to) = (results.join(sweep), dir.path().join(sweep));
         fs::create_dir(&to).unwrap();
