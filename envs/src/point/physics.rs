@@ -30,7 +30,7 @@
 //!
 //! # Why Rapier hardly works
 //! A disc whose path leads to no wall has no contact to solve, and one that meets a wall has a contact on one axis
-//! alone. Both are done here in Rapier's order and precision ([`Contact`]), which gives the same bits (tested) in a
+//! alone. Both are done here in Rapier's order and precision (`Contact`), which gives the same bits (tested) in a
 //! fraction of the time. Rapier itself moves what is faster than its speed limit, and is the reference.
 
 use super::config::PointConfig;
