@@ -8,15 +8,13 @@
 
 use crate::game::budget::{Budget, Mixing};
 use crate::game::columns::{self, Column, Loops, SAMPLES, exp, ln};
+use crate::game::normal::LOG_2_PI;
 use crate::game::perturbation::{Block, Draws, Family, Perturbation};
 use lava_envs::GaussianLaw;
 use nalgebra::Vector2;
 use rand::{Rng, RngExt};
 use rand_distr::StandardNormal;
 use std::marker::PhantomData;
-
-/// log(2 pi).
-const LOG_2_PI: f64 = 1.837_877_066_409_345_3;
 
 /// The most parameters of a component.
 const MOST_PARAMETERS: usize = 5;

@@ -3,6 +3,9 @@
 use statrs::function::erf::{erfc, erfc_inv};
 use std::f64::consts::{PI, SQRT_2};
 
+/// log(2 pi).
+pub const LOG_2_PI: f64 = 1.837_877_066_409_345_3;
+
 /// Phi(z), the probability below z; accurate in the lower tail.
 pub fn below(z: f64) -> f64 {
     0.5 * erfc(-z / SQRT_2)

@@ -1,6 +1,6 @@
 //! Adam (Kingma & Ba 2015) over one flat vector, with all of its state accessible.
 
-use pulp::{Arch, Simd, WithSimd};
+use crate::game::columns::{self, Loops};
 use serde::{Deserialize, Serialize};
 
 /// Decay rates and the guard of the division, as everywhere in PPO (epsilon is CleanRL's).
@@ -37,7 +37,7 @@ impl Adam {
         let step = (learning_rate / correction[0]) as f32;
         let root = 1.0 / correction[1].sqrt() as f32;
         let moments = [&mut self.first_moment[..], &mut self.second_moment];
-        Arch::new().dispatch(Step { parameters, gradient, moments, step, root });
+        columns::widest(Step { parameters, gradient, moments, step, root });
     }
 }
 
@@ -50,11 +50,9 @@ struct Step<'a> {
     root: f32,
 }
 
-impl WithSimd for Step<'_> {
-    type Output = ();
-
+impl Loops for Step<'_> {
     #[inline(always)]
-    fn with_simd<S: Simd>(self, _: S) {
+    fn run(self) {
         let Step { parameters, gradient, moments: [first, second], step, root } = self;
         let [beta_1, beta_2] = BETA.map(|beta| beta as f32);
         let moments = first.iter_mut().zip(second);

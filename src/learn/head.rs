@@ -9,6 +9,7 @@ use super::options::TrainOptions;
 use super::policy::Mode;
 use crate::game::budget::Budget;
 use crate::game::columns::{self, Column, Loops, SAMPLES, exp, ln};
+use crate::game::normal::LOG_2_PI;
 use crate::game::perturbation::{self, Family, Perturbation};
 use lava_envs::Force;
 use lava_envs::action::{Action, ActionKind, Discrete, Finite};
@@ -413,9 +414,6 @@ impl<A: Discrete, const N: usize> PolicyHead for CategoricalPolicy<A, N> {
         true
     }
 }
-
-/// log(2 pi).
-const LOG_2_PI: f64 = 1.837_877_066_409_345_3;
 
 /// Gaussian over forces in the plane: the actor's outputs are the mean, the constants the log
 /// standard deviations. Its density is that of the draw itself, before the world scales a force
