@@ -9,11 +9,12 @@
 //! | `perturbation/FAMILY/make` | one perturbation from its parameters |
 //! | `perturbation/FAMILY/learn` | likelihood ratio, score and entropy as well |
 //! | `rollout/WORLD` | one step of one of 250 episodes, recorded for both players |
+//! | `network/WORLD/PLAYER` | one sample of a minibatch: the networks' outputs and gradient |
 //! | `update/WORLD/PLAYER` | one sample of the rollout: critic, advantages, all epochs |
 //! | `train/WORLD` | all of it: Algorithm 1 with the antagonist active from the start |
 
 use criterion::{BatchSize, BenchmarkId, Criterion, Throughput, criterion_group, criterion_main};
-use cvar_game::experiment::config::{Config, Source};
+use cvar_game::experiment::config::{self, Config, Source};
 use cvar_game::experiment::registry::standard;
 use cvar_game::game::budget::{Budget, Eta};
 use cvar_game::game::bump::Bump;
@@ -23,9 +24,10 @@ use cvar_game::game::perturbation::{Family, Perturbation};
 use cvar_game::learn::budget_sensitivity::LARGEST;
 use cvar_game::learn::device::Device;
 use cvar_game::learn::family::Named;
-use cvar_game::learn::inputs::Inputs;
+use cvar_game::learn::inputs::{Inputs, Selection};
 use cvar_game::learn::method::{Arena, Setting, Training};
 use cvar_game::learn::methods::game::GameTraining;
+use cvar_game::learn::network::Network;
 use cvar_game::learn::options::TrainOptions;
 use cvar_game::learn::pair::Pair;
 use cvar_game::learn::policy::Mode;
@@ -50,9 +52,19 @@ fn eta() -> Eta {
     Eta::new(ETA).expect("a budget")
 }
 
+/// What the players see, with what a benchmark's name says of it.
+const SEEN: [(&str, &str); 2] = [("coordinates", ""), ("features", "+features")];
+
 /// The default training options of a world, played at the full budget from the start.
 fn options<W: World>() -> TrainOptions {
-    let config = Config::resolve(standard().catalogue(), Source::Default, &[])
+    seeing::<W>(SEEN[0].0)
+}
+
+/// The same, with players that see this.
+fn seeing<W: World>(observation: &str) -> TrainOptions {
+    let observation = config::Setting::parse(&format!("train.observation={observation}"));
+    let observation = observation.expect("an option and its value");
+    let config = Config::resolve(standard().catalogue(), Source::Default, &[observation])
         .expect("the embedded default configuration");
     TrainOptions { budget_wait: 0.0, budget_rise: 0.0, ..config.world(W::NAME).train.clone() }
 }
@@ -113,8 +125,10 @@ fn perturbations_of<F: Family>(criterion: &mut Criterion, name: &str, family: &F
 }
 
 fn rollouts(criterion: &mut Criterion) {
-    rollout::<LavaGrid>(criterion);
-    rollout::<LavaPoint>(criterion);
+    for seen in SEEN {
+        rollout::<LavaGrid>(criterion, seen);
+        rollout::<LavaPoint>(criterion, seen);
+    }
 }
 
 /// How the rollouts are played.
@@ -122,25 +136,62 @@ fn terms() -> Terms {
     Terms { eta: eta(), mode: Mode::Sampled, exploring: 0.0 }
 }
 
-fn rollout<W: Arena>(criterion: &mut Criterion) {
-    let options = options::<W>();
+fn rollout<W: Arena>(criterion: &mut Criterion, (seen, suffix): (&str, &str)) {
+    let name = format!("{}{suffix}", W::NAME);
+    let options = seeing::<W>(seen);
     let mut group = criterion.benchmark_group("rollout");
     group.throughput(Throughput::Elements(options.rollout()));
     let (pair, mut collector) = opening::<W>(&options);
-    group.bench_function(W::NAME, |bencher| {
+    group.bench_function(&name, |bencher| {
         bencher.iter(|| collector.collect(&pair, terms(), &options));
     });
     group.finish();
 }
 
 fn updates(criterion: &mut Criterion) {
-    update::<LavaGrid>(criterion);
-    update::<LavaPoint>(criterion);
+    for seen in SEEN {
+        update::<LavaGrid>(criterion, seen);
+        update::<LavaPoint>(criterion, seen);
+    }
+}
+
+fn networks(criterion: &mut Criterion) {
+    for seen in SEEN {
+        network::<LavaGrid>(criterion, seen);
+        network::<LavaPoint>(criterion, seen);
+    }
+}
+
+fn network<W: Arena>(criterion: &mut Criterion, (seen, suffix): (&str, &str)) {
+    let name = format!("{}{suffix}", W::NAME);
+    let options = seeing::<W>(seen);
+    let mut group = criterion.benchmark_group("network");
+    let (mut pair, mut collector) = opening::<W>(&options);
+    collector.collect(&pair, terms(), &options);
+    let mut differentiate = |player, network: &mut Network, inputs: &Inputs, minibatch: usize| {
+        let indices: Vec<usize> = (0..minibatch).collect();
+        let samples = Selection { all: inputs.rows(), indices: &indices };
+        let mut gradient = Vec::new();
+        group.throughput(Throughput::Elements(minibatch as u64));
+        group.bench_function(BenchmarkId::new(&name, player), |bencher| {
+            bencher.iter(|| {
+                network.differentiate(samples, &mut gradient, |outputs| {
+                    black_box(outputs);
+                });
+            });
+        });
+    };
+    let (played, minibatch) = (&collector.protagonist.inputs, options.protagonist.minibatch);
+    differentiate("protagonist", &mut pair.protagonist.network, played, minibatch);
+    let antagonist = pair.antagonist.as_mut().expect("eta is above 1");
+    let (played, minibatch) = (&collector.antagonist.inputs, options.antagonist.minibatch);
+    differentiate("antagonist", antagonist.network_mut(), played, minibatch);
 }
 
 /// The learning rate is 0: every update costs the same, and the players stay as they are.
-fn update<W: Arena>(criterion: &mut Criterion) {
-    let options = options::<W>();
+fn update<W: Arena>(criterion: &mut Criterion, (seen, suffix): (&str, &str)) {
+    let name = format!("{}{suffix}", W::NAME);
+    let options = seeing::<W>(seen);
     let mut group = criterion.benchmark_group("update");
     group.throughput(Throughput::Elements(options.rollout()));
     let (mut pair, mut collector) = opening::<W>(&options);
@@ -150,7 +201,7 @@ fn update<W: Arena>(criterion: &mut Criterion) {
 
     let player = &mut pair.protagonist;
     let its = &options.protagonist;
-    group.bench_function(BenchmarkId::new(W::NAME, "protagonist"), |bencher| {
+    group.bench_function(BenchmarkId::new(&name, "protagonist"), |bencher| {
         bencher.iter(|| {
             player.update(&collector.protagonist, Signal::Own, 1.0, its, rates(its.entropy), random)
         });
@@ -159,7 +210,7 @@ fn update<W: Arena>(criterion: &mut Criterion) {
     let its = &options.antagonist;
     let observation = pair.observation;
     let more = |inputs: &mut Inputs, by: f64| observation.with_more_budget::<W>(inputs, by);
-    group.bench_function(BenchmarkId::new(W::NAME, "antagonist"), |bencher| {
+    group.bench_function(BenchmarkId::new(&name, "antagonist"), |bencher| {
         bencher.iter(|| {
             let played = &collector.antagonist;
             let sensitivity = options
@@ -173,18 +224,21 @@ fn update<W: Arena>(criterion: &mut Criterion) {
 }
 
 fn trainings(criterion: &mut Criterion) {
-    training::<LavaGrid>(criterion);
-    training::<LavaPoint>(criterion);
+    for seen in SEEN {
+        training::<LavaGrid>(criterion, seen);
+        training::<LavaPoint>(criterion, seen);
+    }
 }
 
-fn training<W: Arena>(criterion: &mut Criterion) {
-    let mut options = options::<W>();
+fn training<W: Arena>(criterion: &mut Criterion, (seen, suffix): (&str, &str)) {
+    let name = format!("{}{suffix}", W::NAME);
+    let mut options = seeing::<W>(seen);
     options.steps = UPDATES * options.rollout();
     let mut group = criterion.benchmark_group("train");
     group.sample_size(10);
     group.throughput(Throughput::Elements(options.steps));
     let setting = setting(&options);
-    group.bench_function(W::NAME, |bencher| {
+    group.bench_function(&name, |bencher| {
         bencher.iter_batched(
             || world::<W>(&options),
             |world| {
@@ -216,6 +270,6 @@ fn configured() -> Criterion {
 criterion_group! {
     name = benches;
     config = configured();
-    targets = perturbations, rollouts, updates, trainings
+    targets = perturbations, networks, rollouts, updates, trainings
 }
 criterion_main!(benches);

@@ -210,7 +210,7 @@ fn check_draws<F: Family>(family: &F, law: F::Law, close: impl Fn(Outcome<F>, Ou
         for nominal in [false, true] {
             let stream = |i: usize| ChaCha8Rng::seed_from_u64(i as u64);
             let mut streams: Vec<ChaCha8Rng> = (0..count).map(stream).collect();
-            let (mut outcomes, mut ratios) = (Vec::new(), vec![0.0; count]);
+            let (mut outcomes, mut ratios, mut error) = (Vec::new(), vec![0.0; count], 0.0);
             family.draw(Draws {
                 parameters: &parameters,
                 laws: &vec![law; count],
@@ -219,7 +219,9 @@ fn check_draws<F: Family>(family: &F, law: F::Law, close: impl Fn(Outcome<F>, Ou
                 nominal,
                 outcomes: &mut outcomes,
                 ratios: &mut ratios,
+                normalisation_error: Some(&mut error),
             });
+            assert!(error < 1e-9, "{error}");
             for i in 0..count {
                 let own: Vec<f64> = parameters.iter().map(|column| column[i]).collect();
                 let perturbation = family.perturbation(&own, &law, budgets[i]);

@@ -12,7 +12,7 @@ use cvar_game::learn::device::Device;
 use cvar_game::learn::head::{
     AntagonistHead, Block, CategoricalPolicy, GaussianPolicy, Head, PolicyHead,
 };
-use cvar_game::learn::inputs::{Columns, Inputs};
+use cvar_game::learn::inputs::{Columns, Inputs, Selection};
 use cvar_game::learn::method::{Arena, Players, Progress, Setting, TrainError, Training};
 use cvar_game::learn::methods::game::{GameTraining, schedule};
 use cvar_game::learn::network::{Network, Outputs, Shape};
@@ -178,8 +178,9 @@ fn check_loss_gradient<H: Head>(head: &H, samples: &[Sample<H>], constants: &[f3
     let y: Vec<f32> = (0..rows * samples.len()).map(|_| random.random_range(-0.8..0.8)).collect();
     let evaluate = |y: &[f32], constants: &[f32]| {
         let (mut y, mut by_c) = (y.to_vec(), vec![0.0; constants.len()]);
-        let mut loss = Loss::new(head, samples, &options, 0.01, constants);
         let stride = samples.len();
+        let indices: Vec<usize> = (0..stride).collect();
+        let mut loss = Loss::new(head, (samples, &indices), &options, 0.01, constants);
         loss.add(Outputs { start: 0, samples: stride, y: &mut y, stride });
         let of = loss.finish(&mut by_c);
         let total = of.policy_loss - 0.01 * of.entropy + 0.5 * of.value_loss;
@@ -311,12 +312,14 @@ fn a_cell_is_its_one_hot_code() {
         long.numbers.extend((0..cells).map(|of| f32::from(u8::from(of == cell))));
         long.numbers.extend(seen);
     }
+    let order: Vec<usize> = (0..samples).rev().collect();
     let run = |shape, inputs: &Inputs| {
         let mut network = Network::from_parameters(shape, parameters.clone(), Device::Cpu);
         let (mut outputs, mut values, mut gradient) = (Vec::new(), Vec::new(), Vec::new());
         network.act(inputs.rows(), &mut outputs);
         network.values(inputs.rows(), &mut values);
-        network.differentiate(inputs.rows(), &mut gradient, |block| {
+        let minibatch = Selection { all: inputs.rows(), indices: &order };
+        network.differentiate(minibatch, &mut gradient, |block| {
             for (i, y) in block.y.iter_mut().enumerate() {
                 *y *= (i % 5) as f32 - 1.5;
             }
@@ -352,7 +355,9 @@ fn what_only_the_critic_sees_is_hidden_from_the_actor() {
         });
         assert_eq!(outputs[0].0, outputs[1].0, "round {round}");
         assert_ne!(outputs[0].1, outputs[1].1, "round {round}");
-        network.differentiate(inputs(0.7).rows(), &mut gradient, |block| block.y.fill(0.3));
+        let inputs = inputs(0.7);
+        let minibatch = Selection { all: inputs.rows(), indices: &[1, 0] };
+        network.differentiate(minibatch, &mut gradient, |block| block.y.fill(0.3));
         network.change(|weights| {
             weights.iter_mut().zip(&gradient).for_each(|(weight, by)| *weight -= 0.1 * by);
         });

@@ -3,7 +3,7 @@
 #![cfg(feature = "torch")]
 
 use cvar_game::learn::device::Device;
-use cvar_game::learn::inputs::{Columns, Rows};
+use cvar_game::learn::inputs::{Columns, Rows, Selection};
 use cvar_game::learn::network::{Network, Outputs, Shape};
 use rand::rngs::ChaCha8Rng;
 use rand::{RngExt, SeedableRng};
@@ -50,7 +50,8 @@ fn network_gradients_equal_autograd() {
     for mut network in [network, by_libtorch] {
         let (mut gradient, mut outputs) = (Vec::new(), vec![0.0; slopes.len()]);
         let rows = Rows { cells: &[], numbers: &inputs };
-        network.differentiate(rows, &mut gradient, |Outputs { start, samples, y, stride }| {
+        let all = Selection { all: rows, indices: &(0..n).collect::<Vec<_>>() };
+        network.differentiate(all, &mut gradient, |Outputs { start, samples, y, stride }| {
             for (row, y) in y.chunks_exact_mut(stride).enumerate() {
                 for (i, y) in y[..samples].iter_mut().enumerate() {
                     let at = row * n + start + i;

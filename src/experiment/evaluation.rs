@@ -38,11 +38,15 @@ pub struct Contestants<'a, W: World> {
     pub progress: &'a dyn Fn(),
 }
 
-/// All plays of the protocol, the budget audit and the certificate.
+/// All plays of the protocol, the budget audit and the certificate. The watcher sees the play of the greedy
+/// protagonist against its antagonist, and at least so many of its episodes.
 ///
 /// # Errors
 /// If the world refuses its constants, cannot be solved, or the budget audit finds a violation.
-pub fn protocol<W: Arena + Solvable>(of: &Contestants<'_, W>) -> Result<Findings, RunError> {
+pub fn protocol<W: Arena + Solvable>(
+    of: &Contestants<'_, W>,
+    (watcher, watched): (&mut dyn Watcher<W>, u64),
+) -> Result<Findings, RunError> {
     let mut plays = Vec::new();
     let mut keep = |mode, chance, played: Played| {
         plays.push(to_play(mode, chance, &played));
@@ -56,11 +60,14 @@ pub fn protocol<W: Arena + Solvable>(of: &Contestants<'_, W>) -> Result<Findings
         of.play_episodes(Mode::Sampled, shadow.as_mut(), Draw::Nominal, episodes, &mut ())?;
     let weighted = keep(Mode::Sampled, Chance::Nominal, weighted);
     let mut audit = None;
-    if of.players.opponent().is_some() {
-        let mut perturbed = |mode| -> Result<Played, RunError> {
-            Ok(keep(mode, Chance::Antagonist, of.play(mode, Chance::Antagonist, &mut ())?))
-        };
-        let (greedy, sampled) = (perturbed(Mode::Greedy)?, perturbed(Mode::Sampled)?);
+    if let Some(mut opponent) = of.players.opponent() {
+        let all = episodes.max(watched);
+        let mut greedy =
+            of.play_episodes(Mode::Greedy, opponent.as_mut(), Draw::Perturbed, all, watcher)?;
+        greedy.episodes.truncate(episodes as usize);
+        let greedy = keep(Mode::Greedy, Chance::Antagonist, greedy);
+        let sampled = of.play(Mode::Sampled, Chance::Antagonist, &mut ())?;
+        let sampled = keep(Mode::Sampled, Chance::Antagonist, sampled);
         audit = Some(budget_audit(of.run, &[&greedy, &sampled, &weighted])?);
     }
     let certificate = of.certify(&mut plays)?;

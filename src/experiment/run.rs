@@ -125,7 +125,7 @@ fn evaluate<W: Arena + Solvable>(
     // Those of the protocol, and those from which figures are drawn.
     let EvaluationOptions { episodes, figure_episodes, .. } = run.evaluation;
     let of = match contestants.players.opponent() {
-        Some(_) => 4 * episodes + figure_episodes,
+        Some(_) => 3 * episodes + episodes.max(figure_episodes),
         None => 2 * episodes,
     };
     let (played, told, report) = (Cell::new(0), Cell::new(0), RefCell::new(report));
@@ -139,10 +139,9 @@ fn evaluate<W: Arena + Solvable>(
     };
     let contestants = Contestants { progress: &progress, ..*contestants };
     let found = stop.interruptible(|| {
-        Ok::<_, RunError>((
-            evaluation::protocol(&contestants)?,
-            figure_data::collect(&contestants)?,
-        ))
+        let mut shown = figure_data::perturbed(&contestants)?;
+        let found = evaluation::protocol(&contestants, (&mut shown, figure_episodes))?;
+        Ok::<_, RunError>((found, figure_data::collect(&contestants, shown)?))
     });
     let (found, shown) = found.ok_or(RunError::Unfinished)??;
     let path = folder.join(figure_data::FILE);

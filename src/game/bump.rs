@@ -16,7 +16,7 @@
 //! | S | `covariance` |
 //! | m | `mean` |
 
-use super::columns::{exp, ln};
+use super::columns::{exp, exp_m1, ln};
 use super::gaussian::{Component, Gradient, MOST};
 use super::squashed::Squashed;
 use nalgebra::{Matrix2, Vector2};
@@ -85,17 +85,18 @@ impl Bump {
         self.covariance.matrix()
     }
 
-    /// log of the integral of P exp(-1/2 (xi-c)' K (xi-c)) over the plane, log Z, evaluated with a
-    /// decomposition of K of its own.
+    /// log Z, of the integral of P exp(-1/2 (xi-c)' K (xi-c)) over the plane, taken over one axis after the other.
+    #[inline(always)]
     pub fn log_integral(&self) -> f64 {
-        let eigen = self.curvature().symmetric_eigen();
-        let along = eigen.eigenvectors.transpose() * self.center();
-        (0..2)
-            .map(|i| {
-                let k = eigen.eigenvalues[i];
-                -0.5 * k.ln_1p() - 0.5 * along[i] * along[i] * k / (1.0 + k)
-            })
-            .sum()
+        let Symmetric { xx, xy, yy } = self.curvature;
+        let [x, y] = self.center.value;
+        // Over the second axis it leaves exp(-1/2 (first u^2 + 2 linear u + rest)) / sqrt(second), with u the
+        // distance to x along the first.
+        let second = 1.0 + yy;
+        let first = 1.0 + xx - xy * xy / second;
+        let linear = x - xy * y / second;
+        let rest = x * x + yy * y * y / second;
+        -0.5 * (ln(second * first) + rest - linear * linear / first)
     }
 
     /// xi - c.
@@ -193,9 +194,10 @@ impl Component for Bump {
         gradient[4] = factor[2];
     }
 
-    /// With a decomposition of K of its own.
+    /// With [`Bump::log_integral`].
+    #[inline(always)]
     fn normalisation_error(&self) -> f64 {
-        (self.log_supremum + self.log_integral()).exp_m1()
+        exp_m1(self.log_supremum + self.log_integral())
     }
 }
 

@@ -62,7 +62,7 @@ impl<const N: usize> Family for FiniteFamily<N> {
     }
 
     fn draw<R: Rng>(&self, draws: Draws<'_, '_, FiniteLaw<N>, R>) {
-        let Draws { parameters, laws, budgets, random, nominal, outcomes, ratios } = draws;
+        let Draws { parameters, laws, budgets, random, nominal, outcomes, ratios, .. } = draws;
         let [mut all, mut probabilities] = [[[0.0; SAMPLES]; N]; 2];
         columns::widest(Ratios {
             parameters,
@@ -77,6 +77,10 @@ impl<const N: usize> Family for FiniteFamily<N> {
             let outcome = sample_index(drawn_from, random);
             outcomes.push(outcome);
             ratios[i] = all[outcome][i];
+        }
+        if let Some(largest) = draws.normalisation_error {
+            let sums = (0..laws.len()).map(|i| probabilities.iter().map(|of| of[i]).sum::<f64>());
+            *largest = sums.map(|sum| (sum - 1.0).abs()).fold(*largest, f64::max);
         }
     }
 

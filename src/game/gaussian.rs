@@ -51,7 +51,7 @@ pub trait Component: Copy + std::fmt::Debug + Send + 'static {
     /// + by_lost lost_entropy`.
     fn pull_back(&self, xi: Vector2<f64>, by: Gradient, gradient: &mut [f64]);
 
-    /// `E_P[delta^0_j]` - 1, evaluated in another way than the ratio itself.
+    /// `E_P[delta^0_j]` - 1, evaluated in another way than the ratio itself; to 1e-12 of 1.
     fn normalisation_error(&self) -> f64;
 }
 
@@ -141,7 +141,7 @@ impl<C: Component> Family for GaussianFamily<C> {
     fn draw<R: Rng>(&self, draws: Draws<'_, '_, GaussianLaw, R>) {
         let Draws { parameters, budgets, random, nominal, outcomes, ratios, .. } = draws;
         let mut xi = [[0.0; SAMPLES]; 2];
-        let [mut level, mut uniform, mut ratio] = [[0.5; SAMPLES]; 3];
+        let [mut level, mut uniform, mut ratio, mut error] = [[0.5; SAMPLES]; 4];
         let mut budget = [1.0; SAMPLES];
         for (i, random) in random.iter_mut().enumerate() {
             budget[i] = budgets[i].get();
@@ -162,8 +162,12 @@ impl<C: Component> Family for GaussianFamily<C> {
             xi: &mut xi,
             nominal,
             ratio: &mut ratio,
+            error: draws.normalisation_error.is_some().then_some(&mut error),
         });
         let drawn = ratios.len();
+        if let Some(largest) = draws.normalisation_error {
+            *largest = error[..drawn].iter().copied().fold(*largest, f64::max);
+        }
         outcomes.extend((0..drawn).map(|i| Vector2::new(xi[0][i], xi[1][i])));
         ratios.copy_from_slice(&ratio[..drawn]);
     }
@@ -231,12 +235,14 @@ struct Reweight<'a, C> {
     nominal: bool,
     /// Receives delta(xi).
     ratio: &'a mut Column,
+    /// Receives the error of the normalisation, if it is requested.
+    error: Option<&'a mut Column>,
 }
 
 impl<C: Component> Loops for Reweight<'_, C> {
     #[inline(always)]
     fn run(self) {
-        let Reweight { family, parameters, budget, level, uniform, xi, nominal, ratio } = self;
+        let Reweight { family, parameters, budget, level, uniform, xi, nominal, ratio, .. } = self;
         let count = family.count;
         let weights = family.weights(parameters);
         let mut supremum = [0.0; SAMPLES];
@@ -276,6 +282,18 @@ impl<C: Component> Loops for Reweight<'_, C> {
         }
         for i in 0..SAMPLES {
             ratio[i] = mixings[i].likelihood_ratio(base[i]);
+        }
+        if let Some(error) = self.error {
+            *error = [0.0; SAMPLES];
+            for (j, weight) in weights[..count].iter().enumerate() {
+                let of = &parameters[own::<C>(j)];
+                for i in 0..SAMPLES {
+                    error[i] += weight[i] * family.component(of, i, j).normalisation_error();
+                }
+            }
+            for i in 0..SAMPLES {
+                error[i] = mixings[i].weight * error[i].abs();
+            }
         }
     }
 }

@@ -33,7 +33,8 @@ pub trait Family: Clone + std::fmt::Debug {
     /// Draws outcomes of a block of laws. Families override it with columns ([`super::columns`]); this is their
     /// reference.
     fn draw<R: Rng>(&self, draws: Draws<'_, '_, Self::Law, R>) {
-        let Draws { parameters, laws, budgets, random, nominal, outcomes, ratios } = draws;
+        let Draws { parameters, laws, budgets, random, nominal, outcomes, ratios, .. } = draws;
+        let mut error: f64 = 0.0;
         let mut own = vec![0.0; self.parameters()];
         for (i, random) in random.iter_mut().enumerate() {
             for (own, column) in own.iter_mut().zip(parameters) {
@@ -44,6 +45,10 @@ pub trait Family: Clone + std::fmt::Debug {
                 if nominal { laws[i].sample(random) } else { perturbation.sample(random) };
             outcomes.push(outcome);
             ratios[i] = perturbation.likelihood_ratio(outcome);
+            error = error.max(perturbation.normalisation_error());
+        }
+        if let Some(largest) = draws.normalisation_error {
+            *largest = largest.max(error);
         }
     }
 
@@ -88,6 +93,8 @@ pub struct Draws<'a, 'r, L: Law, R> {
     pub outcomes: &'a mut Vec<L::Outcome>,
     /// Receives delta(o).
     pub ratios: &'a mut [f64],
+    /// Becomes the largest [`Perturbation::normalisation_error`] of all and itself, if it is requested.
+    pub normalisation_error: Option<&'a mut f64>,
 }
 
 /// What learning needs of the perturbations of at most `SAMPLES` samples.

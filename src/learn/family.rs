@@ -248,11 +248,10 @@ impl<F: Family + Send + 'static> Antagonist<F::Law> for Player<AntagonistHead<F>
     }
 
     fn reweight(&self, of: Reweighting<'_, F::Law>) {
-        let Reweighting { outputs, laws, budgets, draw, streams, stream, outcomes, ratios, .. } =
-            of;
+        let Reweighting { outputs, laws, budgets, draw, streams, stream, .. } = of;
+        let Reweighting { outcomes, ratios, mut normalisation_error, .. } = of;
         let (slots, count) = (laws.len(), self.head.outputs());
         let mut parameters = vec![[0.0; SAMPLES]; count];
-        let mut error: f64 = 0.0;
         for (start, streams) in (0..slots).step_by(SAMPLES).zip(streams.chunks_mut(SAMPLES)) {
             let mut random: SmallVec<[&mut ChaCha8Rng; SAMPLES]> =
                 streams.iter_mut().map(stream).collect();
@@ -266,14 +265,6 @@ impl<F: Family + Send + 'static> Antagonist<F::Law> for Player<AntagonistHead<F>
                     }
                 }
             }
-            if of.normalisation_error.is_some() {
-                let mut own = vec![0.0; count];
-                for (i, slot) in block.clone().enumerate() {
-                    own.iter_mut().zip(&parameters).for_each(|(to, column)| *to = column[i]);
-                    let perturbation = self.head.0.perturbation(&own, &laws[slot], budgets[slot]);
-                    error = error.max(perturbation.normalisation_error());
-                }
-            }
             self.head.0.draw(Draws {
                 parameters: &parameters,
                 laws: &laws[block.clone()],
@@ -282,10 +273,8 @@ impl<F: Family + Send + 'static> Antagonist<F::Law> for Player<AntagonistHead<F>
                 nominal: draw == Draw::Nominal,
                 outcomes,
                 ratios: &mut ratios[block],
+                normalisation_error: normalisation_error.as_deref_mut(),
             });
-        }
-        if let Some(largest) = of.normalisation_error {
-            *largest = largest.max(error);
         }
     }
 

@@ -50,6 +50,15 @@ impl Inputs {
     }
 }
 
+/// Some samples of a batch.
+#[derive(Debug, Clone, Copy)]
+pub struct Selection<'a> {
+    /// The batch.
+    pub all: Rows<'a>,
+    /// Indices of the samples.
+    pub indices: &'a [usize],
+}
+
 impl<'a> Rows<'a> {
     /// The samples before an index and those from it on; `width` is the length of a sample's numbers.
     pub fn split_at(self, sample: usize, width: usize) -> [Rows<'a>; 2] {
@@ -59,6 +68,7 @@ impl<'a> Rows<'a> {
     }
 
     /// One sample.
+    #[cfg(feature = "torch")]
     pub fn row(self, sample: usize, width: usize) -> Rows<'a> {
         let cells = if self.cells.is_empty() { &[] } else { &self.cells[sample..=sample] };
         Rows { cells, numbers: &self.numbers[sample * width..][..width] }

@@ -28,7 +28,7 @@ mod fused;
 mod tensors;
 
 use super::device::Device;
-use super::inputs::{Columns, Rows};
+use super::inputs::{Columns, Rows, Selection};
 use fused::Fused;
 use nalgebra::DMatrix;
 use rand::{Rng, RngExt};
@@ -125,10 +125,10 @@ enum Engine {
     Torch(Tensors),
 }
 
-/// Samples of a batch with their outputs, for which the loss is to be computed.
+/// Samples of a minibatch with their outputs, for which the loss is to be computed.
 #[derive(Debug)]
 pub struct Outputs<'a> {
-    /// Index of the first of them in the batch.
+    /// Index of the first of them in the minibatch.
     pub start: usize,
     /// Number of them.
     pub samples: usize,
@@ -255,12 +255,12 @@ impl Network {
         }
     }
 
-    /// Outputs and gradient in one: evaluates y on a batch of inputs as in [`Network::act`], lets
+    /// Outputs and gradient in one: evaluates y on a minibatch of inputs as in [`Network::act`], lets
     /// `loss` turn it into dL/dy block by block, and writes dL/d parameters, except for those of the
     /// constants c and of what the actor does not see, which are zero.
     pub fn differentiate(
         &mut self,
-        inputs: Rows<'_>,
+        inputs: Selection<'_>,
         gradient: &mut Vec<f32>,
         loss: impl FnMut(Outputs<'_>),
     ) {

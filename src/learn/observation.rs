@@ -257,9 +257,10 @@ fn show_time<W: World>(world: &W, slot: usize, room: &mut [f32]) {
 /// The Fourier basis of as many of the first coordinates as there is room for.
 fn fourier(coordinates: &[f32], waves: &mut [f32]) {
     for (waves, coordinate) in waves.chunks_exact_mut(WAVES).zip(coordinates) {
-        for (octave, pair) in waves.chunks_exact_mut(2).enumerate() {
-            let phase = FRAC_PI_2 * (1 << octave) as f32 * (coordinate + 1.0);
-            pair.copy_from_slice(&[phase.sin(), phase.cos()]);
+        let (mut sin, mut cos) = (FRAC_PI_2 * (coordinate + 1.0)).sin_cos();
+        for pair in waves.chunks_exact_mut(2) {
+            pair.copy_from_slice(&[sin, cos]);
+            (sin, cos) = (2.0 * sin * cos, 1.0 - 2.0 * sin * sin); // of twice the phase
         }
     }
 }

@@ -84,8 +84,8 @@ impl<W: Arena> Pair<W> {
         }
     }
 
-    /// The antagonist at play, if there is one; `audit` requests the normalisation error, which is
-    /// too slow to compute in training.
+    /// The antagonist at play, if there is one; `audit` requests the normalisation error, which training does not
+    /// need.
     pub fn opponent(&self, audit: bool) -> Option<LearnedOpponent<'_, W>> {
         let antagonist = self.antagonist.as_deref()?;
         let normalisation_error = audit.then_some(0.0);

@@ -16,7 +16,7 @@ use crate::learn::budget_sensitivity::BudgetSensitivity;
 use crate::learn::device::Device;
 use crate::learn::gae::{self, Estimates};
 use crate::learn::head::{Block, Head};
-use crate::learn::inputs::{Columns, Inputs};
+use crate::learn::inputs::{Columns, Selection};
 use crate::learn::network::{Network, Outputs, Shape};
 use crate::learn::options::PlayerOptions;
 use crate::learn::state::{PlayerState, Unfit};
@@ -43,8 +43,6 @@ struct Workspace<H: Head> {
     advantages: Vec<f32>,
     samples: Vec<Sample<H>>,
     order: Vec<usize>,
-    inputs: Inputs,
-    batch: Vec<Sample<H>>,
     gradient: Vec<f32>,
 }
 
@@ -55,8 +53,6 @@ impl<H: Head> Default for Workspace<H> {
             advantages: Vec::new(),
             samples: Vec::new(),
             order: Vec::new(),
-            inputs: Inputs::default(),
-            batch: Vec::new(),
             gradient: Vec::new(),
         }
     }
@@ -276,8 +272,7 @@ impl<H: Head> Player<H> {
         rates: Rates,
         random: &mut ChaCha8Rng,
     ) -> Losses {
-        let Workspace { values, advantages, samples, order, inputs, batch, gradient } =
-            &mut self.workspace;
+        let Workspace { values, advantages, samples, order, gradient } = &mut self.workspace;
         self.network.values(trajectories.inputs.rows(), values);
         gae::advantages(
             &trajectories.rewards,
@@ -309,7 +304,6 @@ impl<H: Head> Player<H> {
         }
         let centred = !matches!(signal, Signal::Uncentred(_));
 
-        let width = self.network.shape().width();
         order.clear();
         order.extend(0..samples.len());
         let mut losses =
@@ -319,18 +313,14 @@ impl<H: Head> Player<H> {
         for _ in 0..options.epochs {
             order.shuffle(random);
             for indices in order.chunks(options.minibatch) {
-                inputs.clear();
-                batch.clear();
-                for &i in indices {
-                    inputs.extend(trajectories.inputs.rows().row(i, width));
-                    batch.push(samples[i].clone());
-                }
                 let constants = self.network.constants().to_vec();
-                let mut loss = Loss::new(&self.head, batch, options, rates.entropy, &constants);
+                let minibatch = (&samples[..], indices);
+                let mut loss = Loss::new(&self.head, minibatch, options, rates.entropy, &constants);
                 if !centred {
                     loss = loss.uncentred();
                 }
-                self.network.differentiate(inputs.rows(), gradient, |block| loss.add(block));
+                let inputs = Selection { all: trajectories.inputs.rows(), indices };
+                self.network.differentiate(inputs, gradient, |block| loss.add(block));
                 let at = gradient.len() - constants.len();
                 let mut step = loss.finish(&mut gradient[at..]);
                 step.gradient_norm = clip_norm(gradient, options.gradient_norm);
@@ -350,6 +340,7 @@ impl<H: Head> Player<H> {
 pub struct Loss<'a, H: Head> {
     head: &'a H,
     samples: &'a [Sample<H>],
+    indices: &'a [usize],
     terms: Terms,
     given: Vec<H::Given>,
     choices: Vec<H::Choice>,
@@ -386,18 +377,19 @@ struct Sums {
 }
 
 impl<'a, H: Head> Loss<'a, H> {
-    /// The loss of these samples, with the head's constants.
+    /// The loss of a minibatch, the samples of these indices, with the head's constants.
     pub fn new(
         head: &'a H,
-        samples: &'a [Sample<H>],
+        (samples, indices): (&'a [Sample<H>], &'a [usize]),
         options: &'a PlayerOptions,
         entropy_weight: f64,
         constants: &[f32],
     ) -> Self {
-        let number = samples.len() as f64;
-        let mean = samples.iter().map(|s| f64::from(s.advantage)).sum::<f64>() / number;
-        let variance = samples.iter().map(|s| (f64::from(s.advantage) - mean).powi(2)).sum::<f64>()
-            / (number - 1.0).max(1.0);
+        let number = indices.len() as f64;
+        let advantages = indices.iter().map(|&i| f64::from(samples[i].advantage));
+        let mean = advantages.clone().sum::<f64>() / number;
+        let squares = advantages.map(|advantage| (advantage - mean).powi(2)).sum::<f64>();
+        let variance = squares / (number - 1.0).max(1.0);
         let terms = Terms {
             clip: options.clip,
             entropy_weight,
@@ -413,6 +405,7 @@ impl<'a, H: Head> Loss<'a, H> {
         Loss {
             head,
             samples,
+            indices,
             terms,
             given: Vec::with_capacity(SAMPLES),
             choices: Vec::with_capacity(SAMPLES),
@@ -432,9 +425,10 @@ impl<'a, H: Head> Loss<'a, H> {
 
     /// The same with advantages that are not centred, and scaled by their root mean square.
     pub fn uncentred(mut self) -> Self {
-        let squares = self.samples.iter().map(|s| f64::from(s.advantage).powi(2)).sum::<f64>();
+        let advantages = self.indices.iter().map(|&i| f64::from(self.samples[i].advantage));
+        let squares = advantages.map(|advantage| advantage.powi(2)).sum::<f64>();
         self.terms.mean = 0.0;
-        self.terms.scale = 1.0 / ((squares / self.samples.len() as f64).sqrt() + 1e-8);
+        self.terms.scale = 1.0 / ((squares * self.terms.share).sqrt() + 1e-8);
         self
     }
 
@@ -448,13 +442,11 @@ impl<'a, H: Head> Loss<'a, H> {
     }
 
     fn add_columns(&mut self, start: usize, count: usize, y: &mut [f32], stride: usize) {
-        let Loss { head, samples, terms, given, choices, sums, .. } = self;
+        let Loss { head, terms, given, choices, sums, .. } = self;
         let Loss { parameters, score, entropy_gradient, .. } = self;
-        let samples = &samples[start..start + count];
+        let samples = self.indices[start..start + count].iter().map(|&i| &self.samples[i]);
         given.clear();
-        given.extend(samples.iter().map(|sample| sample.given));
         choices.clear();
-        choices.extend(samples.iter().map(|sample| sample.choice));
         let none = [0.0; SAMPLES];
         let outputs = head.outputs();
         for (column, row) in parameters[..outputs].iter_mut().zip(y.chunks(stride)) {
@@ -462,6 +454,18 @@ impl<'a, H: Head> Loss<'a, H> {
             for (parameter, &output) in column.iter_mut().zip(&row[..count]) {
                 *parameter = f64::from(output);
             }
+        }
+        let (mut old, mut advantage, mut target, mut value) = (none, none, none, none);
+        // A share of 0 leaves out what is no sample.
+        let mut share = none;
+        for (i, sample) in samples.enumerate() {
+            given.push(sample.given);
+            choices.push(sample.choice);
+            old[i] = sample.log_probability;
+            advantage[i] = f64::from(sample.advantage);
+            target[i] = f64::from(sample.target);
+            value[i] = f64::from(y[outputs * stride + i]);
+            share[i] = terms.share;
         }
         let (mut log_probability, mut entropy) = (none, none);
         head.gradients_of_block(Block {
@@ -473,16 +477,6 @@ impl<'a, H: Head> Loss<'a, H> {
             score,
             entropy_gradient,
         });
-        let (mut old, mut advantage, mut target, mut value) = (none, none, none, none);
-        // A share of 0 leaves out what is no sample.
-        let mut share = none;
-        for (i, sample) in samples.iter().enumerate() {
-            old[i] = sample.log_probability;
-            advantage[i] = f64::from(sample.advantage);
-            target[i] = f64::from(sample.target);
-            value[i] = f64::from(y[outputs * stride + i]);
-            share[i] = terms.share;
-        }
         columns::widest(Clipped {
             terms: *terms,
             share: &share,

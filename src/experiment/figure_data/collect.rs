@@ -8,6 +8,7 @@ use crate::exact::yardstick::Solvable;
 use crate::experiment::artefacts::{Chance, SCHEMA};
 use crate::experiment::evaluation::Contestants;
 use crate::experiment::failure::RunError;
+use crate::game::columns::ln;
 use crate::game::returns::ReturnSoFar;
 use crate::learn::method::Arena;
 use crate::learn::play::Watcher;
@@ -30,18 +31,31 @@ const BUDGET_BINS: f64 = 200.0;
 /// without bound.
 const MOST_LEFT: f64 = 4.0;
 
-/// Plays for all figure data of trained players.
+/// The watcher of the greedy protagonist's play against its antagonist.
+///
+/// # Errors
+/// If the world refuses its constants.
+pub fn perturbed<W: Arena + Solvable>(of: &Contestants<'_, W>) -> Result<Collector, RunError> {
+    let world = W::new(of.constants, 1)?;
+    let (counts, episodes) = (Counts::new(&world.scene()), of.run.evaluation.figure_episodes);
+    Ok(Collector::new(of, Chance::Antagonist, counts, (episodes, world.horizon())))
+}
+
+/// All figure data of trained players, from what [`perturbed`] has watched and from further plays.
 ///
 /// # Errors
 /// If the world refuses its constants or cannot be solved.
-pub fn collect<W: Arena + Solvable>(of: &Contestants<'_, W>) -> Result<FigureData, RunError> {
+pub fn collect<W: Arena + Solvable>(
+    of: &Contestants<'_, W>,
+    perturbed: Collector,
+) -> Result<FigureData, RunError> {
     let Contestants { run, constants, players, .. } = of;
     let episodes = run.evaluation.figure_episodes;
     let world = W::new(constants, 1)?;
-    let (scene, horizon) = (world.scene(), world.horizon());
-    let mut nominal = Collector::new(of, Chance::Nominal, None, horizon);
+    let scene = world.scene();
     // Nominal episodes carry the antagonist's likelihood ratios of what happens.
     let shown = NOMINAL.min(episodes);
+    let mut nominal = Collector::new(of, Chance::Nominal, None, (shown, world.horizon()));
     match players.opponent() {
         Some(mut shadow) => {
             of.play_episodes(Mode::Greedy, shadow.as_mut(), Draw::Nominal, shown, &mut nominal)?
@@ -50,10 +64,7 @@ pub fn collect<W: Arena + Solvable>(of: &Contestants<'_, W>) -> Result<FigureDat
     };
     let mut stored: Vec<StoredEpisode> = nominal.stored().cloned().collect();
     let (mut counts, mut budget) = (None, None);
-    if let Some(mut antagonist) = players.opponent() {
-        let mut perturbed = Collector::new(of, Chance::Antagonist, Counts::new(&scene), horizon);
-        let antagonist = antagonist.as_mut();
-        of.play_episodes(Mode::Greedy, antagonist, Draw::Perturbed, episodes, &mut perturbed)?;
+    if players.opponent().is_some() {
         stored.extend(perturbed.stored().cloned());
         budget = Some(perturbed.budgets.summary());
         counts = perturbed.counts;
@@ -198,22 +209,24 @@ impl Counts {
                 map.visits[bin] += 1;
                 map.shift[bin][0] += dx;
                 map.shift[bin][1] += dy;
-                map.divergence[bin] += step.ratio.ln();
+                map.divergence[bin] += ln(step.ratio);
             }
         }
     }
 }
 
 /// The watcher of one play.
-struct Collector {
+pub struct Collector {
     chance: Chance,
+    /// How many episodes are collected, the first ones.
+    episodes: u64,
     /// 1 / log eta, or 0 at eta = 1.
     scale: f64,
     counts: Option<Counts>,
     budgets: Budgets,
     /// Steps between the places of a thinned trajectory.
     stride: usize,
-    /// The episode in each slot, up to [`MOST_STEPS`] steps.
+    /// The episode in each slot, up to [`MOST_STEPS`] steps, if it may be one to be stored.
     running: Vec<StoredEpisode>,
     /// Where each slot is, and its time.
     now: Vec<([f64; 2], usize)>,
@@ -228,11 +241,12 @@ impl Collector {
         of: &Contestants<'_, W>,
         chance: Chance,
         counts: Option<Counts>,
-        horizon: u32,
+        (episodes, horizon): (u64, u32),
     ) -> Self {
         let eta = of.run.eta;
         Collector {
             chance,
+            episodes,
             scale: if eta.is_neutral() { 0.0 } else { 1.0 / eta.get().ln() },
             counts,
             budgets: Budgets { every: horizon.div_ceil(MOST_TIMES), ..Budgets::default() },
@@ -249,6 +263,12 @@ impl Collector {
         self.first.iter().take(STORED).chain(&self.lava).filter(whole)
     }
 
+    /// Whether the episode of this index may be one to be stored.
+    fn may_store(&self, index: u64) -> bool {
+        let room = self.lava.len() < STORED_LAVA;
+        index < TRAJECTORIES as u64 || room || self.lava.last().is_some_and(|of| index < of.index)
+    }
+
     /// Keeps the episode that has ended in the slot, if it is one to be stored.
     fn keep(&mut self, slot: usize) {
         let episode = &self.running[slot];
@@ -260,8 +280,25 @@ impl Collector {
             return;
         };
         let place = list.partition_point(|kept| kept.index < episode.index);
-        list.insert(place, episode.clone());
+        list.insert(place, episode.rounded());
         list.truncate(room);
+    }
+}
+
+impl StoredEpisode {
+    /// The same with as many digits as the file has.
+    fn rounded(&self) -> StoredEpisode {
+        let pairs = |list: &[[f64; 2]]| list.iter().map(|pair| pair.map(rounded)).collect();
+        let numbers = |list: &[f64]| list.iter().copied().map(significant).collect();
+        StoredEpisode {
+            value: rounded(self.value),
+            path: pairs(&self.path),
+            actions: pairs(&self.actions),
+            outcomes: pairs(&self.outcomes),
+            ratios: numbers(&self.ratios),
+            budgets: numbers(&self.budgets),
+            ..*self
+        }
     }
 }
 
@@ -282,19 +319,13 @@ impl<W: World> Watcher<W> for Collector {
             self.running.resize(slot + 1, none);
             self.now.resize(slot + 1, Default::default());
         }
-        self.now[slot] = (world.position(slot).map(rounded), world.time(slot) as usize);
-        let episode = &mut self.running[slot];
-        if world.time(slot) == 0 {
-            episode.path.clear();
-            episode.actions.clear();
-            episode.outcomes.clear();
-            episode.ratios.clear();
-            episode.budgets.clear();
-            episode.path.push(self.now[slot].0);
-        }
+        self.now[slot] = (world.position(slot), world.time(slot) as usize);
     }
 
     fn after(&mut self, game: &VectorGame<W>, slot: usize, index: usize, so_far: &ReturnSoFar) {
+        if index as u64 >= self.episodes {
+            return;
+        }
         let (place, time) = self.now[slot];
         let step = game.steps[slot];
         let recorded = Recorded::<W> {
@@ -303,29 +334,40 @@ impl<W: World> Watcher<W> for Collector {
             ratio: game.ratios[slot],
         };
         let before = game.budgets_before[slot].get();
-        let left = (before.ln() * self.scale).min(MOST_LEFT);
+        let left = (ln(before) * self.scale).min(MOST_LEFT);
         if self.chance == Chance::Antagonist {
             self.budgets.add(time, left);
         }
         if let Some(counts) = &mut self.counts {
             counts.add(place, left, &recorded);
         }
+        if !self.may_store(index as u64) {
+            return;
+        }
         let episode = &mut self.running[slot];
-        episode.index = index as u64;
+        if time == 0 {
+            episode.index = index as u64;
+            episode.path.clear();
+            episode.actions.clear();
+            episode.outcomes.clear();
+            episode.ratios.clear();
+            episode.budgets.clear();
+            episode.path.push(place);
+        }
         let whole = time < MOST_STEPS;
         if whole || time.is_multiple_of(self.stride) || step.end.is_some() {
-            episode.path.push(game.world.position(slot).map(rounded));
+            episode.path.push(game.world.position(slot));
         }
         if whole {
-            episode.actions.push(W::action_arrow(recorded.action).map(rounded));
-            episode.outcomes.push(W::outcome_arrow(recorded.outcome).map(rounded));
-            episode.ratios.push(significant(recorded.ratio));
-            episode.budgets.push(significant(before));
+            episode.actions.push(W::action_arrow(recorded.action));
+            episode.outcomes.push(W::outcome_arrow(recorded.outcome));
+            episode.ratios.push(recorded.ratio);
+            episode.budgets.push(before);
         }
         if let Some(end) = step.end {
             episode.end = end;
-            episode.value = rounded(so_far.value);
-            episode.budgets.push(significant(game.budgets[slot].get()));
+            episode.value = so_far.value;
+            episode.budgets.push(game.budgets[slot].get());
             self.keep(slot);
         }
     }
@@ -352,7 +394,7 @@ impl Budgets {
         }
         self.sums[time] += left;
         let histogram = &mut self.histograms[time];
-        let bin = (left * BUDGET_BINS).round() as usize;
+        let bin = (left * BUDGET_BINS + 0.5) as usize;
         if histogram.len() <= bin {
             histogram.resize(bin + 1, 0);
         }

@@ -14,7 +14,7 @@
 
 mod collect;
 
-pub use collect::collect;
+pub use collect::{Collector, collect, perturbed};
 
 /// Name of the file in a run's folder.
 pub const FILE: &str = "figure_data.json";

@@ -9,7 +9,7 @@
 
 use super::{Outputs, Shape};
 use crate::game::columns::SAMPLES;
-use crate::learn::inputs::Rows;
+use crate::learn::inputs::{Rows, Selection};
 use pulp::{Arch, Simd, WithSimd};
 
 /// Numbers that begin at a multiple of 64 bytes: a vector load then stays within one cache line.
@@ -64,18 +64,29 @@ fn tanh<S: Simd>(simd: S, z: S::f32s) -> S::f32s {
     simd.div_f32s(simd.mul_f32s(z, p), q)
 }
 
-/// Loads a block of samples, of which the last may have fewer; the rest is zero.
-fn load(inputs: &[f32], width: usize, x: &mut [f32]) {
-    x.fill(0.0);
-    for (sample, numbers) in inputs.chunks_exact(width).enumerate() {
+/// Loads the samples of a block, at most `SAMPLES`; the rest is zero.
+fn load<'a>(samples: impl ExactSizeIterator<Item = &'a [f32]>, x: &mut [f32]) {
+    if samples.len() < SAMPLES {
+        x.fill(0.0);
+    }
+    for (sample, numbers) in samples.enumerate() {
         for (row, &number) in x.chunks_exact_mut(SAMPLES).zip(numbers) {
             row[sample] = number;
         }
     }
 }
 
-/// Vectors of a tile.
-const VECTORS: usize = 4;
+/// How many of the remaining rows the next tile has: 16 registers hold the sums of two rows and what they are made
+/// of, 32 those of four.
+#[inline(always)]
+fn tile_rows<S: Simd>(remaining: usize) -> usize {
+    remaining.min(if few_registers::<S>() { 2 } else { 4 })
+}
+
+#[inline(always)]
+fn few_registers<S: Simd>() -> bool {
+    S::REGISTER_COUNT < 32
+}
 
 /// What a sum and the number in its place become.
 #[derive(Clone, Copy)]
@@ -129,17 +140,19 @@ fn combine<S: Simd>(
     while row < rows {
         let tile = &mut out[row * vectors..];
         let weights = Weights { at: weights.at + row * weights.of_row, ..weights };
-        row += match rows - row {
-            1 => combine_tile::<S, 1>(simd, weights, terms, tile, finish),
-            2 => combine_tile::<S, 2>(simd, weights, terms, tile, finish),
-            3 => combine_tile::<S, 3>(simd, weights, terms, tile, finish),
-            _ => combine_tile::<S, 4>(simd, weights, terms, tile, finish),
+        row += match (tile_rows::<S>(rows - row), few_registers::<S>()) {
+            (1, true) => combine_tile::<S, 1, 4>(simd, weights, terms, tile, finish),
+            (_, true) => combine_tile::<S, 2, 4>(simd, weights, terms, tile, finish),
+            (1, false) => combine_tile::<S, 1, 2>(simd, weights, terms, tile, finish),
+            (2, false) => combine_tile::<S, 2, 2>(simd, weights, terms, tile, finish),
+            (3, false) => combine_tile::<S, 3, 2>(simd, weights, terms, tile, finish),
+            (_, false) => combine_tile::<S, 4, 2>(simd, weights, terms, tile, finish),
         };
     }
 }
 
 #[inline(always)]
-fn combine_tile<S: Simd, const R: usize>(
+fn combine_tile<S: Simd, const R: usize, const V: usize>(
     simd: S,
     weights: Weights<'_>,
     terms: &[S::f32s],
@@ -148,10 +161,10 @@ fn combine_tile<S: Simd, const R: usize>(
 ) -> usize {
     let vectors = SAMPLES / S::F32_LANES;
     let out = &mut out[..R * vectors];
-    for vector in (0..vectors).step_by(VECTORS) {
-        let mut sums = [[simd.splat_f32s(0.0); VECTORS]; R];
+    for vector in (0..vectors).step_by(V) {
+        let mut sums = [[simd.splat_f32s(0.0); V]; R];
         for (term, of) in terms.chunks_exact(vectors).enumerate() {
-            let of = &of[vector..][..VECTORS];
+            let of = &of[vector..][..V];
             for (row, sums) in sums.iter_mut().enumerate() {
                 let at = weights.at + row * weights.of_row + term * weights.of_term;
                 let weight = simd.splat_f32s(weights.all[at]);
@@ -179,7 +192,7 @@ fn correlate<S: Simd>(simd: S, a: &[S::f32s], b: &[S::f32s], sums: &mut [S::f32s
     while row < rows {
         let a = &a[row * vectors..];
         let sums = &mut sums[row * columns..];
-        row += match rows - row {
+        row += match tile_rows::<S>(rows - row) {
             1 => correlate_rows::<S, 1>(simd, a, b, sums),
             2 => correlate_rows::<S, 2>(simd, a, b, sums),
             3 => correlate_rows::<S, 3>(simd, a, b, sums),
@@ -333,7 +346,7 @@ impl WithSimd for Evaluate<'_> {
         let mut y = Aligned::default();
         let y = y.slice(rows.len() * SAMPLES);
         for (block, inputs) in inputs.blocks(SAMPLES, width).enumerate() {
-            load(inputs.numbers, width, x);
+            load(inputs.numbers.chunks_exact(width), x);
             hidden_layer(simd, shape, parameters, first, inputs.cells, x, h);
             let start = block * SAMPLES;
             let end = samples.min(start + SAMPLES);
@@ -352,7 +365,7 @@ pub struct Differentiate<'a, L> {
     /// Its parameters.
     pub parameters: &'a [f32],
     /// n samples.
-    pub inputs: Rows<'a>,
+    pub inputs: Selection<'a>,
     /// Receives the gradient by W, V and b.
     pub gradient: &'a mut [f32],
     /// Turns outputs into gradients.
@@ -384,10 +397,16 @@ impl<L: FnMut(Outputs<'_>)> WithSimd for Differentiate<'_, L> {
         by_first.fill(0.0);
         by_second.fill(0.0);
         gradient.fill(0.0);
-        for (block, inputs) in inputs.blocks(SAMPLES, width).enumerate() {
-            let samples = inputs.numbers.len() / width;
-            load(inputs.numbers, width, x);
-            hidden_layer(simd, shape, parameters, 0, inputs.cells, x, h);
+        let Selection { all, indices } = inputs;
+        let mut cells = Vec::new();
+        for (block, indices) in indices.chunks(SAMPLES).enumerate() {
+            let samples = indices.len();
+            load(indices.iter().map(|&i| &all.numbers[i * width..][..width]), x);
+            if shape.columns.cells > 0 {
+                cells.clear();
+                cells.extend(indices.iter().map(|&i| all.cells[i]));
+            }
+            hidden_layer(simd, shape, parameters, 0, &cells, x, h);
             let (actor, critic) = h.split_at(hidden * SAMPLES);
             let (action, value) = y.split_at_mut(shape.outputs * SAMPLES);
             output_rows(simd, shape, parameters, 0..shape.outputs, actor, action);
@@ -399,7 +418,7 @@ impl<L: FnMut(Outputs<'_>)> WithSimd for Differentiate<'_, L> {
             }
             backward(simd, shape, parameters, [x, y], h, by_first, by_second);
             // The gradient by the column of W that a cell selects is that by z.
-            for (sample, &cell) in inputs.cells.iter().enumerate() {
+            for (sample, &cell) in cells.iter().enumerate() {
                 let column = &mut gradient[shape.first_at(0, cell as usize)..][..units];
                 for (sum, by_z) in column.iter_mut().zip(h.chunks_exact(SAMPLES)) {
                     *sum += by_z[sample];

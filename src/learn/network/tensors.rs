@@ -5,7 +5,7 @@
 //! `dL/dh x'`.
 
 use super::{Outputs, Shape};
-use crate::learn::inputs::Rows;
+use crate::learn::inputs::{Inputs, Rows, Selection};
 use tch::{Device, Kind, Tensor};
 
 /// The network on a device.
@@ -81,12 +81,16 @@ impl Tensors {
     pub fn differentiate(
         &mut self,
         parameters: &[f32],
-        inputs: Rows<'_>,
+        inputs: Selection<'_>,
         gradient: &mut Vec<f32>,
         mut loss: impl FnMut(Outputs<'_>),
     ) {
         let shape = self.shape;
-        let x = self.columns(inputs).contiguous();
+        let mut minibatch = Inputs::default();
+        for &index in inputs.indices {
+            minibatch.extend(inputs.all.row(index, shape.width()));
+        }
+        let x = self.columns(minibatch.rows()).contiguous();
         let samples = x.size()[1];
         let buffers = Buffers::of(&mut self.buffers, samples, shape, self.device);
         let _ = self.first.mm_out(&buffers.hidden, &x);
