@@ -253,7 +253,7 @@ fn shipped(name: &str) -> Config {
 
 #[test]
 fn the_shipped_configurations_are_valid() {
-    let paper = [("paper", 120), ("paper-timeless", 60), ("paper-plain", 60)];
+    let paper = [("paper", 120), ("paper-timeless", 60), ("paper-plain", 120)];
     let earlier = [("coordinates", 60), ("ablations", 220)];
     for (name, runs) in [("quick", 18)].into_iter().chain(paper).chain(earlier) {
         let config = shipped(name);

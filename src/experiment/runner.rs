@@ -255,7 +255,8 @@ const PAUSE: Duration = Duration::from_millis(250);
 /// How long nothing happens until [`Event::Quiet`].
 const QUIET: Duration = Duration::from_secs(1);
 
-/// Carries out the runs, `jobs` at a time, and tells `watch` what happens.
+/// Carries out the runs, `jobs` at a time, the longest ones first, so that all are busy to the end, and tells `watch`
+/// what happens.
 pub fn sweep(
     prepared: &Prepared<'_>,
     jobs: NonZeroUsize,
@@ -264,7 +265,9 @@ pub fn sweep(
     watch: &mut dyn FnMut(&Event),
 ) -> Outcome {
     let Prepared { todo, .. } = prepared;
-    let queue: Mutex<VecDeque<&RunConfig>> = Mutex::new(todo.iter().collect());
+    let mut longest_first: Vec<&RunConfig> = todo.iter().collect();
+    longest_first.sort_by(|a, b| b.work().total_cmp(&a.work()));
+    let queue = Mutex::new(VecDeque::from(longest_first));
     let (events, incoming) = mpsc::channel();
     let mut outcome = Outcome::default();
     std::thread::scope(|scope| {

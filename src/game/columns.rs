@@ -120,6 +120,22 @@ pub fn ln(x: f64) -> f64 {
     k * LN_2[0] + (2.0 * s * sum + k * LN_2[1]) + defect
 }
 
+/// [`ln`] of each number, with the widest vectors.
+pub fn logarithms(numbers: impl Iterator<Item = f64>) -> Vec<f64> {
+    struct Each<'a>(&'a mut [f64]);
+    impl Loops for Each<'_> {
+        #[inline(always)]
+        fn run(self) {
+            for number in self.0 {
+                *number = ln(*number);
+            }
+        }
+    }
+    let mut numbers: Vec<f64> = numbers.collect();
+    widest(Each(&mut numbers));
+    numbers
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -139,6 +155,9 @@ mod tests {
                 }
             }
         }
+        let numbers: Vec<f64> = (1..40).map(f64::from).collect();
+        let logs = logarithms(numbers.iter().copied());
+        assert!(logs.iter().zip(&numbers).all(|(log, number)| close(*log, number.ln(), 4.0)));
     }
 
     #[test]

@@ -30,6 +30,7 @@ use super::method::Arena;
 use super::options::{CriticSees, TrainOptions, View};
 use super::policy::{DrawSituation, Situation};
 use crate::game::budget::{Budget, Eta};
+use crate::game::columns::logarithms;
 use lava_envs::{Action, World};
 use std::f32::consts::FRAC_PI_2;
 use std::ops::Range;
@@ -136,9 +137,13 @@ impl Observation {
     pub fn show_budgets<W: World>(&self, budgets: &[Budget], rows: &mut [f32]) {
         let place = self.place_columns::<W>(W::OBSERVATION);
         let width = self.protagonist_columns::<W>().numbers + 1;
-        for (row, budget) in rows.chunks_exact_mut(width).zip(budgets) {
-            let (_, at) = self.time_and_budget(width - 1 - place);
-            row[place..][at].fill((budget.get().ln() * self.budget_scale) as f32);
+        let (_, at) = self.time_and_budget(width - 1 - place);
+        if at.is_empty() {
+            return;
+        }
+        let logs = logarithms(budgets.iter().map(|budget| budget.get()));
+        for (row, log) in rows.chunks_exact_mut(width).zip(logs) {
+            row[place..][at.clone()].fill((log * self.budget_scale) as f32);
         }
     }
 
@@ -158,8 +163,9 @@ impl Observation {
         let place = self.place_columns::<W>(W::OBSERVATION);
         let width = self.draw_columns::<W>().numbers + 1;
         self.show_states(of.world, width, inputs);
+        let logs = logarithms(of.budgets.iter().map(|budget| budget.get()));
         for (slot, row) in inputs.numbers.chunks_exact_mut(width).enumerate() {
-            row[place] = (of.budgets[slot].get().ln() * self.antagonist_budget_scale) as f32;
+            row[place] = (logs[slot] * self.antagonist_budget_scale) as f32;
             close(of.world, slot, &mut row[place + 1..]);
         }
     }
@@ -186,6 +192,7 @@ impl Observation {
         let place = self.place_columns::<W>(W::SITUATION);
         inputs.cells.clear();
         inputs.numbers.resize(of.world.episodes() * width, 0.0);
+        let logs = logarithms(of.budgets.iter().map(|budget| budget.get()));
         for (slot, row) in inputs.numbers.chunks_exact_mut(width).enumerate() {
             let action = of.actions[slot];
             if let (1.., Some(model)) = (self.states, of.world.finite()) {
@@ -196,7 +203,7 @@ impl Observation {
                 of.world.situation(slot, action, situation);
                 fourier(situation, waves);
             }
-            row[place] = (of.budgets[slot].get().ln() * self.antagonist_budget_scale) as f32;
+            row[place] = (logs[slot] * self.antagonist_budget_scale) as f32;
             close(of.world, slot, &mut row[place + 1..]);
         }
     }

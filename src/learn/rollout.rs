@@ -11,6 +11,7 @@ use super::state::{GamesState, SlotState, Unfit};
 use super::trajectories::Trajectories;
 use super::vector_game::VectorGame;
 use crate::game::budget::{Budget, Eta};
+use crate::game::columns::logarithms;
 use crate::game::returns::{Atom, ReturnSoFar};
 use lava_envs::random::{Purpose, position, stream, stream_from};
 use lava_envs::{End, Law, World};
@@ -181,12 +182,13 @@ impl<W: Arena> Collector<W> {
     fn record_antagonist(&mut self, opponent: &LearnedOpponent<'_, W>) {
         let (game, record) = (&self.game, &mut self.antagonist);
         record.inputs.extend(opponent.inputs.rows());
-        for slot in 0..game.slots() {
+        let log_ratios = logarithms(game.ratios.iter().copied());
+        for (slot, log_ratio) in log_ratios.into_iter().enumerate() {
             let (law, outcome) = (game.laws[slot], game.outcomes[slot]);
             record.given.push((law, game.budgets_before[slot]));
             record.choices.push(outcome);
             // The antagonist's law is the perturbed law: log(P_t(o) delta_t(o)).
-            record.log_probabilities.push(law.log_density(outcome) + game.ratios[slot].ln());
+            record.log_probabilities.push(law.log_density(outcome) + log_ratio);
             record.rewards.push(-game.steps[slot].reward as f32);
             record.ended.push(game.steps[slot].end.is_some());
         }

@@ -19,6 +19,7 @@
 
 use super::lattice::{Halves, Space, cubic, shares};
 use crate::exact::watch::Watch;
+use crate::game::columns::{Loops, widest};
 use lava_envs::{End, PointConfig};
 use std::sync::Mutex;
 
@@ -190,7 +191,9 @@ pub fn sweep(
                     loop {
                         let next = queue.lock().expect("no worker panics with the queue").next();
                         let Some((x, (means, values))) = next else { break };
-                        programme.column(x, ends, &later, means, values, &mut work);
+                        let (later, work) = (&later[..], &mut work);
+                        let programme = &programme;
+                        widest(Column { programme, x, ends, later, means, values, work });
                     }
                 });
             }
@@ -210,6 +213,7 @@ pub fn sweep(
 
 /// Interpolation that stays between the two middle values, from the weights of a cubic: a cubic where that is
 /// so, and no overshoot beside a border (Bermejo and Staniforth 1992).
+#[inline(always)]
 fn limited([a, b, c, d]: [f32; 4], weights: [f32; 4]) -> f32 {
     let cubic = weights[0] * a + weights[1] * b + weights[2] * c + weights[3] * d;
     cubic.clamp(b.min(c), b.max(c))
@@ -282,24 +286,31 @@ struct Programme<'a> {
     along_y: Vec<[f32; 4]>,
 }
 
-impl Programme<'_> {
-    /// All nodes of one x: reads V of the next time in `later`, laid out by x, v_x, y, v_y with v on
-    /// rho times the lattice of v+, and writes W and V of this time.
-    fn column(
-        &self,
-        x: usize,
-        ends: Ends,
-        later: &[f32],
-        means: &mut [f32],
-        values: &mut [f32],
-        work: &mut Work,
-    ) {
-        let Sizes { ny, mean, plus, .. } = self.sizes;
-        self.outcomes(x, later, work);
+/// All nodes of one x.
+struct Column<'a> {
+    programme: &'a Programme<'a>,
+    x: usize,
+    ends: Ends,
+    /// V of the next time, by x, v_x, y, v_y with v on rho times the lattice of v+.
+    later: &'a [f32],
+    /// Receives W of this time.
+    means: &'a mut [f32],
+    /// Receives V of this time.
+    values: &'a mut [f32],
+    work: &'a mut Work,
+}
+
+impl Loops for Column<'_> {
+    #[inline(always)]
+    fn run(self) {
+        let Column { programme, x, ends, later, means, values, work } = self;
+        let Sizes { ny, mean, plus, .. } = programme.sizes;
+        let space = programme.space;
+        programme.outcomes(x, later, work);
         for y in 0..ny {
             let node = x * ny + y;
             let means = &mut means[y * mean * mean..][..mean * mean];
-            if let Some(end) = self.space.stopped[node] {
+            if let Some(end) = space.stopped[node] {
                 let value = if end == End::Lava { ends.lava } else { ends.goal };
                 means.fill(value);
                 for i in 0..plus {
@@ -308,19 +319,22 @@ impl Programme<'_> {
                 continue;
             }
             let outcomes = &mut work.outcomes[y * plus * plus..][..plus * plus];
-            for (outcome, &code) in outcomes.iter_mut().zip(&self.space.events[node]) {
+            for (outcome, &code) in outcomes.iter_mut().zip(&space.events[node]) {
                 if code != 0 {
                     let (lava, goal) = shares(code);
                     *outcome = *outcome * (1.0 - lava - goal) + ends.lava * lava + ends.goal * goal;
                 }
             }
-            smooth(outcomes, &self.space.kernel, plus, mean, &mut work.half_smooth, means);
-            self.best(means, &mut work.row, &mut work.values);
-            self.upsample(&work.values, &mut work.half_up, y, values);
+            smooth(outcomes, &space.kernel, plus, mean, &mut work.half_smooth, means);
+            programme.best(means, &mut work.row, &mut work.values);
+            programme.upsample(&work.values, &mut work.half_up, y, values);
         }
     }
+}
 
+impl Programme<'_> {
     /// Q of a column but for the ends, by y, v+_x, v+_y.
+    #[inline(always)]
     fn outcomes(&self, x: usize, later: &[f32], work: &mut Work) {
         let Sizes { ny, plus, .. } = self.sizes;
         let nx = self.space.axes[0].nodes;
@@ -360,6 +374,7 @@ impl Programme<'_> {
     }
 
     /// V = max over the actions of W at v + A u.
+    #[inline(always)]
     fn best(&self, means: &[f32], row: &mut [f32], values: &mut [f32]) {
         let Sizes { before, mean, .. } = self.sizes;
         let margin = (self.space.halves.mean - self.space.halves.before) as i64;
@@ -383,6 +398,7 @@ impl Programme<'_> {
     }
 
     /// From the lattice of v to velocities rho v+, into the column's part at y.
+    #[inline(always)]
     fn upsample(&self, values: &[f32], half: &mut [f32], y: usize, up: &mut [f32]) {
         let Sizes { ny, before, plus, .. } = self.sizes;
         for (row, half) in values.chunks_exact(before).zip(half.chunks_exact_mut(plus)) {
@@ -403,6 +419,7 @@ impl Programme<'_> {
 }
 
 /// W from Q: Gaussian smoothing along both axes, from `plus`^2 to `mean`^2 velocities.
+#[inline(always)]
 pub fn smooth(
     outcomes: &[f32],
     kernel: &[f32],

@@ -12,7 +12,7 @@ use crate::experiment::names::{MethodName, RunId, VariantName};
 use crate::game::budget::Eta;
 use crate::learn::device::Device;
 use crate::learn::method;
-use crate::learn::options::TrainOptions;
+use crate::learn::options::{PlayerOptions, TrainOptions};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -79,6 +79,26 @@ impl RunConfig {
         let mut table = Table::try_from(self).expect("a configuration is representable as TOML");
         table.remove("evaluation");
         table.to_string()
+    }
+
+    /// How long the run takes, in units that runs can be compared by: samples that go through its networks, times
+    /// their hidden units.
+    pub fn work(&self) -> f64 {
+        let TrainOptions { protagonist, antagonist, .. } = &self.train;
+        let EvaluationOptions { episodes, figure_episodes, .. } = self.evaluation;
+        // An update takes a pass forwards and one back, which is twice as much.
+        let learning = |of: &PlayerOptions| 3.0 * f64::from(of.epochs) * of.hidden as f64;
+        let mut playing = protagonist.hidden as f64;
+        let (update, plays) = if self.eta.is_neutral() {
+            (learning(protagonist), 2 * episodes)
+        } else {
+            playing += antagonist.hidden as f64;
+            let updates = [learning(protagonist), learning(antagonist)];
+            (updates[0].midpoint(updates[1]), 3 * episodes + figure_episodes.max(episodes))
+        };
+        let train = self.train.whole_steps() as f64 * (update + playing);
+        // A rollout has as many steps as an episode.
+        train + (plays as f64 * self.train.rollout_steps as f64) * playing
     }
 
     /// The text of the run's `config.toml`.
