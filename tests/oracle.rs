@@ -4,7 +4,7 @@ use approx::assert_abs_diff_eq;
 use cvar_game::exact::oracle::controller::{Controller, Protagonist, Scripted};
 use cvar_game::exact::oracle::lattice::{Scene, Space, cubic};
 use cvar_game::exact::oracle::play::play;
-use cvar_game::exact::oracle::sweep::{Rewards, SWEPT, Utility, smooth, sweep};
+use cvar_game::exact::oracle::sweep::{Rewards, SWEPT, Utility, smoothed, sweep};
 use cvar_game::exact::oracle::{Certified, Effort, Lattice, certify, certify_cached, shipped};
 use cvar_game::exact::watch::Watch;
 use lava_envs::law::{GaussianLaw, Law};
@@ -41,9 +41,7 @@ fn smoothing_is_the_gaussian_expectation() {
     let outcomes: Vec<f32> = (0..plus * plus)
         .map(|index| f(space.plus(index / plus), space.plus(index % plus)) as f32)
         .collect();
-    let mut half = vec![0.0; plus * mean];
-    let mut means = vec![0.0; mean * mean];
-    smooth(&outcomes, &space.kernel, plus, mean, &mut half, &mut means);
+    let means = smoothed(&space, &outcomes);
     // E sin(a (m + s z) + b) = sin(a m + b) exp(-a^2 s^2 / 2), and so for the cosine.
     let damped = |a: f64| (-0.5 * a * a * config.noise * config.noise).exp();
     for (index, &found) in means.iter().enumerate() {
@@ -65,9 +63,7 @@ fn smoothing_of_a_step_is_the_normal_distribution_function_up_to_its_cell() {
     let outcomes: Vec<f32> = (0..plus * plus)
         .map(|index| if space.plus(index / plus) > step_at { 1.0 } else { 0.0 })
         .collect();
-    let mut half = vec![0.0; plus * mean];
-    let mut means = vec![0.0; mean * mean];
-    smooth(&outcomes, &space.kernel, plus, mean, &mut half, &mut means);
+    let means = smoothed(&space, &outcomes);
     for k in 0..mean {
         let vbar = space.plus(k + space.halves.plus - space.halves.mean);
         let (count, reach) = (20_000, 8.0);

@@ -329,7 +329,8 @@ pub fn certify(
     let script = (0..scripts.len())
         .max_by(|&a, &b| baselines[a].cvar.total_cmp(&baselines[b].cvar))
         .expect("there are scripts");
-    let mut best = problem.try_out(&scripts[script], &mut steps)?;
+    let mut selection = problem.select(&scripts[script], &mut steps)?;
+    let mut best = None;
     let mut chosen = (baselines[script].name.clone(), None);
     let mut lattice_value = f64::NEG_INFINITY;
     for &(_, threshold) in ranked.iter().take(effort.candidates.max(1)) {
@@ -338,26 +339,33 @@ pub fn certify(
         let controller =
             Controller::new(space.clone(), &problem.rewards, utility, problem.threads(), &step);
         lattice_value = lattice_value.max(problem.risk(threshold, controller.value()));
-        let tried = problem.try_out(&controller, &mut steps)?;
-        if tried.selection >= best.selection {
-            best = tried;
+        let selected = problem.select(&controller, &mut steps)?;
+        if selected >= selection {
+            selection = selected;
+            best = Some(problem.certify(&controller, &mut steps)?);
             chosen = (CONTROLLER.to_owned(), threshold);
+        } else {
+            steps.next(problem.playing(effort.episodes)).done(1.0);
         }
     }
+    let mut best = match best {
+        Some(best) => best,
+        None => problem.certify(&scripts[script], &mut steps)?,
+    };
 
     // A script whose few episodes say that it is better is heard in as many.
     for (scripted, baseline) in scripts.iter().zip(&mut baselines) {
-        if baseline.cvar > best.played.law.cvar(alpha) {
+        if baseline.cvar > best.law.cvar(alpha) {
             let played = problem.play(scripted, effort.episodes, CERTIFYING_SEED, &())?;
             *baseline = Baseline::new(scripted.name(), &played.law, alpha);
-            if baseline.cvar > best.played.law.cvar(alpha) {
-                best.played = played;
+            if baseline.cvar > best.law.cvar(alpha) {
+                best = played;
                 chosen = (scripted.name(), None);
             }
         }
     }
 
-    let Tried { played: Played { law, crossing_y, .. }, .. } = best;
+    let Played { law, crossing_y, .. } = best;
     let mean = Interval::new(law.mean(), law.mean_standard_error());
     let cvar = if alpha == 1.0 {
         mean
@@ -403,14 +411,6 @@ struct Problem<'a> {
     alpha: f64,
     effort: &'a Effort,
     rewards: Rewards,
-}
-
-/// A protagonist that was played.
-struct Tried {
-    /// Its CVaR_alpha over the episodes that choose.
-    selection: f64,
-    /// The episodes that certify.
-    played: Played,
 }
 
 impl Problem<'_> {
@@ -462,18 +462,27 @@ impl Problem<'_> {
         play(self.config, self.gamma, protagonist, episodes, seed, self.threads(), watch)
     }
 
-    /// Plays the episodes that choose, and those that certify.
-    fn try_out(
+    /// The CVaR_alpha of a protagonist over the episodes that choose.
+    fn select(
         &self,
         protagonist: &dyn Protagonist,
         steps: &mut Steps<'_>,
-    ) -> Result<Tried, ConfigError> {
-        let Effort { selection_episodes, episodes, .. } = *self.effort;
-        let step = steps.next(self.playing(selection_episodes));
-        let law = self.play(protagonist, selection_episodes, SELECTION_SEED, &step)?.law;
+    ) -> Result<f64, ConfigError> {
+        let episodes = self.effort.selection_episodes;
         let step = steps.next(self.playing(episodes));
-        let played = self.play(protagonist, episodes, CERTIFYING_SEED, &step)?;
-        Ok(Tried { selection: law.cvar(self.alpha), played })
+        let played = self.play(protagonist, episodes, SELECTION_SEED, &step)?;
+        Ok(played.law.cvar(self.alpha))
+    }
+
+    /// The episodes that certify a protagonist.
+    fn certify(
+        &self,
+        protagonist: &dyn Protagonist,
+        steps: &mut Steps<'_>,
+    ) -> Result<Played, ConfigError> {
+        let episodes = self.effort.episodes;
+        let step = steps.next(self.playing(episodes));
+        self.play(protagonist, episodes, CERTIFYING_SEED, &step)
     }
 
     /// Cost of playing, in the unit of [`sweep::cost`]: half an episode of a controller and of the engine.
@@ -491,7 +500,8 @@ impl Problem<'_> {
         looks(thresholds) as f64 * sweep::cost(coarse, SWEPT)
             + sweep::cost(coarse, PLAYED)
             + candidates * sweep::cost(fine, SWEPT)
-            + (candidates + 1.0) * self.playing(selection_episodes + episodes)
+            + candidates * self.playing(selection_episodes + episodes)
+            + self.playing(selection_episodes)
             + self.playing(scripts * baseline_episodes)
     }
 }

@@ -3,6 +3,7 @@
 use super::lattice::Space;
 use super::sweep::{PLAYED, Rewards, SWEPT, Utility, actions, sweep};
 use crate::exact::watch::Watch;
+use crate::game::columns::{Loops, widest};
 use lava_envs::PointConfig;
 use lava_envs::point::Force;
 use lava_envs::random::ChaCha8Rng;
@@ -72,7 +73,27 @@ const WINDOW: usize = 32;
 
 impl Protagonist for Controller {
     fn act(&self, time: u32, position: [f64; 2], velocity: [f64; 2], _: &mut ChaCha8Rng) -> Force {
-        let space = &self.space;
+        let mut best = [0.0, 0.0];
+        widest(Choose { controller: self, time, position, velocity, best: &mut best });
+        Force(Vector2::from(best))
+    }
+}
+
+/// What a controller chooses.
+struct Choose<'a> {
+    controller: &'a Controller,
+    time: u32,
+    position: [f64; 2],
+    velocity: [f64; 2],
+    /// Receives the push; 0 where nothing is known.
+    best: &'a mut [f64; 2],
+}
+
+impl Loops for Choose<'_> {
+    #[inline(always)]
+    fn run(self) {
+        let Choose { controller, time, position, velocity, best } = self;
+        let space = &controller.space;
         let ny = space.axes[1].nodes;
         let count = 2 * space.halves.mean + 1;
         let [(x, fx), (y, fy)] = [0, 1].map(|axis| space.axes[axis].locate(position[axis]));
@@ -99,7 +120,7 @@ impl Protagonist for Controller {
                 continue;
             }
             total += weight;
-            let table = &self.means[(time as usize * space.nodes() + node) * count * count..];
+            let table = &controller.means[(time as usize * space.nodes() + node) * count * count..];
             for i in 0..width_x {
                 let row = &table[(first[0] + i) * count + first[1]..][..width_y];
                 for (entry, mean) in window[i * WINDOW..][..width_y].iter_mut().zip(row) {
@@ -107,15 +128,14 @@ impl Protagonist for Controller {
                 }
             }
         }
-        let mut best = [0.0, 0.0];
         if total > 0.0 {
             let mut highest = f32::NEG_INFINITY;
-            for option in &self.actions {
+            for option in &controller.actions {
                 let place = [0, 1].map(|axis| centre[axis] + option.change[axis]);
                 let below = place.map(f64::floor);
                 let at = [0, 1].map(|axis| below[axis] as usize - 1 - first[axis]);
-                let wx = (space.weights)(place[0] - below[0]);
-                let wy = (space.weights)(place[1] - below[1]);
+                let wx = space.weights(place[0] - below[0]);
+                let wy = space.weights(place[1] - below[1]);
                 let mut mean = 0.0;
                 for (p, across) in wx.iter().enumerate() {
                     let row = &window[(at[0] + p) * WINDOW + at[1]..][..4];
@@ -124,11 +144,10 @@ impl Protagonist for Controller {
                 }
                 if mean > highest {
                     highest = mean;
-                    best = option.push;
+                    *best = option.push;
                 }
             }
         }
-        Force(Vector2::from(best))
     }
 }
 

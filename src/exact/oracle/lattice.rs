@@ -113,8 +113,8 @@ pub struct Space {
     pub halves: Halves,
     /// Weights of the Gaussian smoothing, of length 2 (plus - mean) + 1, summing to 1.
     pub kernel: Vec<f32>,
-    /// Weights of four nodes for interpolation in velocity.
-    pub weights: fn(f64) -> [f32; 4],
+    /// Whether velocities are interpolated by straight lines in place of cubics.
+    pub straight: bool,
     /// Displacement in s per unit of v+.
     pub reach: f64,
     /// Which end a node itself is, by `x * ny + y`.
@@ -165,7 +165,7 @@ impl Space {
             spacing,
             halves,
             kernel,
-            weights: if config.noise / spacing < SMOOTH { linear } else { cubic },
+            straight: config.noise / spacing < SMOOTH,
             reach: reach(config),
             stopped: Vec::new(),
             events: Vec::new(),
@@ -190,6 +190,12 @@ impl Space {
         let table = f64::from(config.horizon) * square(mean) * 4.0;
         // V of two times in single precision, and the shares of ends in bytes.
         nodes(0) * nodes(1) * (table + square(plus) * 9.0)
+    }
+
+    /// Weights of four nodes for interpolation in velocity, at `share` between the middle ones.
+    #[inline(always)]
+    pub fn weights(&self, share: f64) -> [f32; 4] {
+        if self.straight { linear(share) } else { cubic(share) }
     }
 
     /// Number of position nodes.
@@ -481,11 +487,13 @@ fn time_to_disc(from: [f64; 2], path: [f64; 2], centre: [f64; 2], radius: f64) -
 }
 
 /// Weights of the straight line between nodes 0 and 1 at `share` in [0, 1], as [`cubic`] orders them.
+#[inline(always)]
 pub fn linear(share: f64) -> [f32; 4] {
     [0.0, (1.0 - share) as f32, share as f32, 0.0]
 }
 
 /// Weights of the cubic through four equally spaced nodes -1, 0, 1, 2 at `share` in [0, 1].
+#[inline(always)]
 pub fn cubic(share: f64) -> [f32; 4] {
     let s = share;
     [

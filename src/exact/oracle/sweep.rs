@@ -96,12 +96,19 @@ struct Stencil {
 }
 
 impl Stencil {
+    /// Those of all pushes, with the same u_x one after the other.
+    fn all(space: &Space, pushes: Rings) -> Vec<Stencil> {
+        let mut pushes = actions(pushes);
+        pushes.sort_by(|a, b| a[0].total_cmp(&b[0]));
+        pushes.into_iter().map(|push| Stencil::new(space, push)).collect()
+    }
+
     fn new(space: &Space, push: [f64; 2]) -> Stencil {
         let places = push.map(|u| u * space.config.acceleration / space.spacing);
         let below = places.map(f64::floor);
         Stencil {
             offset: below.map(|node| node as i64 - 1),
-            weights: [0, 1].map(|axis| (space.weights)(places[axis] - below[axis])),
+            weights: [0, 1].map(|axis| space.weights(places[axis] - below[axis])),
         }
     }
 }
@@ -116,7 +123,7 @@ fn upsampling(space: &Space) -> Vec<(usize, [f32; 4])> {
             let first = (place.floor() as usize).clamp(1, last - 2);
             let share = place - first as f64;
             // Beyond the outer stencils the cubic is continued, as far as the last node.
-            (first - 1, (space.weights)(share))
+            (first - 1, space.weights(share))
         })
         .collect()
 }
@@ -156,7 +163,7 @@ pub fn sweep(
     let programme = Programme {
         space,
         sizes,
-        stencils: actions(pushes).into_iter().map(|push| Stencil::new(space, push)).collect(),
+        stencils: Stencil::all(space, pushes),
         upsampling: upsampling(space),
         limited: space.blurs(),
         along_y: if space.blurs() {
@@ -226,22 +233,34 @@ struct Ends {
     goal: f32,
 }
 
+/// Numbers that are computed at once: an arithmetic operation on an array of them is one on a vector register.
+const LANES: usize = 8;
+
 #[derive(Debug, Clone, Copy)]
 struct Sizes {
     ny: usize,
     before: usize,
     mean: usize,
     plus: usize,
+    /// Lengths of the rows of Q, W and V in the work space: whole lanes, and what is read beyond.
+    wide_plus: usize,
+    wide_mean: usize,
+    wide_before: usize,
 }
 
 impl Sizes {
     fn of(space: &Space) -> Sizes {
         let count = |half: usize| 2 * half + 1;
+        let Halves { before, mean, plus } = space.halves;
+        let (before, mean, plus) = (count(before), count(mean), count(plus));
         Sizes {
             ny: space.axes[1].nodes,
-            before: count(space.halves.before),
-            mean: count(space.halves.mean),
-            plus: count(space.halves.plus),
+            before,
+            mean,
+            plus,
+            wide_plus: plus.next_multiple_of(LANES) + LANES,
+            wide_mean: mean.next_multiple_of(LANES) + LANES,
+            wide_before: (before + 3).next_multiple_of(LANES) + LANES,
         }
     }
 }
@@ -254,23 +273,92 @@ struct Work {
     outcomes: Vec<f32>,
     /// Q smoothed in v+_y.
     half_smooth: Vec<f32>,
-    /// V by v_x, v_y.
+    /// W by vbar_x, vbar_y.
+    means: Vec<f32>,
+    /// V by v_x, v_y, and by v_y, v_x.
     values: Vec<f32>,
-    row: Vec<f32>,
-    /// V by v_x, rho v+_y.
+    turned: Vec<f32>,
+    /// V by rho v+_y, v_x, and by v_x, rho v+_y.
     half_up: Vec<f32>,
+    half_turned: Vec<f32>,
+    /// W at v_x + A u_x, by v_x, vbar_y.
+    rows: Vec<f32>,
+    sums: Vec<f32>,
 }
 
 impl Work {
     fn new(sizes: Sizes) -> Work {
-        let Sizes { ny, before, mean, plus } = sizes;
+        let Sizes { ny, before, mean, plus, wide_plus, wide_mean, wide_before } = sizes;
         Work {
             slab: vec![0.0; ny * plus],
-            outcomes: vec![0.0; ny * plus * plus],
-            half_smooth: vec![0.0; plus * mean],
-            values: vec![0.0; before * before],
-            row: vec![0.0; before + 3],
-            half_up: vec![0.0; before * plus],
+            outcomes: vec![0.0; ny * plus * wide_plus],
+            half_smooth: vec![0.0; plus * wide_mean],
+            means: vec![0.0; mean * wide_mean],
+            values: vec![0.0; before * wide_before],
+            turned: vec![0.0; before * wide_before],
+            half_up: vec![0.0; plus * wide_before],
+            half_turned: vec![0.0; before * wide_plus],
+            rows: vec![0.0; before * wide_mean],
+            sums: vec![0.0; wide_plus],
+        }
+    }
+}
+
+/// `sums[k] = sum_m weights[m] terms[first + m stride + k]` for `count` numbers, and for what fills their last lanes.
+#[inline(always)]
+fn combine(
+    sums: &mut [f32],
+    count: usize,
+    weights: &[f32],
+    terms: &[f32],
+    first: usize,
+    stride: usize,
+) {
+    let (mut at, lanes) = (0, count.div_ceil(LANES));
+    while at < lanes {
+        let (sums, first) = (&mut sums[at * LANES..], first + at * LANES);
+        at += match lanes - at {
+            1 => combine_lanes::<1>(sums, weights, terms, first, stride),
+            2 => combine_lanes::<2>(sums, weights, terms, first, stride),
+            3 => combine_lanes::<3>(sums, weights, terms, first, stride),
+            _ => combine_lanes::<4>(sums, weights, terms, first, stride),
+        };
+    }
+}
+
+#[inline(always)]
+fn combine_lanes<const N: usize>(
+    sums: &mut [f32],
+    weights: &[f32],
+    terms: &[f32],
+    first: usize,
+    stride: usize,
+) -> usize {
+    let mut own = [[0.0_f32; LANES]; N];
+    for (m, weight) in weights.iter().enumerate() {
+        let terms = &terms[first + m * stride..][..N * LANES];
+        for (own, terms) in own.iter_mut().zip(terms.as_chunks::<LANES>().0) {
+            for (sum, term) in own.iter_mut().zip(terms) {
+                *sum += weight * term;
+            }
+        }
+    }
+    sums[..N * LANES].copy_from_slice(own.as_flattened());
+    N
+}
+
+/// Writes the transpose of a matrix with `rows` rows of `columns` numbers.
+#[inline(always)]
+fn turn(
+    from: &[f32],
+    [rows, columns]: [usize; 2],
+    from_stride: usize,
+    to: &mut [f32],
+    to_stride: usize,
+) {
+    for (k, to) in to.chunks_exact_mut(to_stride).take(columns).enumerate() {
+        for (i, to) in to[..rows].iter_mut().enumerate() {
+            *to = from[i * from_stride + k];
         }
     }
 }
@@ -304,7 +392,8 @@ impl Loops for Column<'_> {
     #[inline(always)]
     fn run(self) {
         let Column { programme, x, ends, later, means, values, work } = self;
-        let Sizes { ny, mean, plus, .. } = programme.sizes;
+        let sizes = programme.sizes;
+        let Sizes { ny, mean, plus, wide_plus, wide_mean, .. } = sizes;
         let space = programme.space;
         programme.outcomes(x, later, work);
         for y in 0..ny {
@@ -318,16 +407,24 @@ impl Loops for Column<'_> {
                 }
                 continue;
             }
-            let outcomes = &mut work.outcomes[y * plus * plus..][..plus * plus];
-            for (outcome, &code) in outcomes.iter_mut().zip(&space.events[node]) {
-                if code != 0 {
-                    let (lava, goal) = shares(code);
-                    *outcome = *outcome * (1.0 - lava - goal) + ends.lava * lava + ends.goal * goal;
+            let outcomes = &mut work.outcomes[y * plus * wide_plus..][..plus * wide_plus];
+            let codes = space.events[node].chunks_exact(plus);
+            for (row, codes) in outcomes.chunks_exact_mut(wide_plus).zip(codes) {
+                for (outcome, &code) in row.iter_mut().zip(codes) {
+                    if code != 0 {
+                        let (lava, goal) = shares(code);
+                        *outcome =
+                            *outcome * (1.0 - lava - goal) + ends.lava * lava + ends.goal * goal;
+                    }
                 }
             }
-            smooth(outcomes, &space.kernel, plus, mean, &mut work.half_smooth, means);
-            programme.best(means, &mut work.row, &mut work.values);
-            programme.upsample(&work.values, &mut work.half_up, y, values);
+            smooth(&work.outcomes, y, &space.kernel, sizes, &mut work.half_smooth, &mut work.means);
+            for (row, from) in means.chunks_exact_mut(mean).zip(work.means.chunks_exact(wide_mean))
+            {
+                row.copy_from_slice(&from[..mean]);
+            }
+            programme.best(work);
+            programme.upsample(work, y, values);
         }
     }
 }
@@ -336,7 +433,7 @@ impl Programme<'_> {
     /// Q of a column but for the ends, by y, v+_x, v+_y.
     #[inline(always)]
     fn outcomes(&self, x: usize, later: &[f32], work: &mut Work) {
-        let Sizes { ny, plus, .. } = self.sizes;
+        let Sizes { ny, plus, wide_plus, .. } = self.sizes;
         let nx = self.space.axes[0].nodes;
         let [along_x, along_y] = &self.space.landings;
         let size = ny * plus;
@@ -356,7 +453,7 @@ impl Programme<'_> {
                 }
             }
             for y in 0..ny {
-                let outcomes = &mut work.outcomes[(y * plus + i) * plus..][..plus];
+                let outcomes = &mut work.outcomes[(y * plus + i) * wide_plus..][..plus];
                 let landings = &along_y[y * plus..][..plus];
                 for (k, (outcome, landing)) in outcomes.iter_mut().zip(landings).enumerate() {
                     let place = landing.node * plus + landing.velocity;
@@ -375,23 +472,29 @@ impl Programme<'_> {
 
     /// V = max over the actions of W at v + A u.
     #[inline(always)]
-    fn best(&self, means: &[f32], row: &mut [f32], values: &mut [f32]) {
-        let Sizes { before, mean, .. } = self.sizes;
+    fn best(&self, work: &mut Work) {
+        let Sizes { before, mean, wide_mean, wide_before, .. } = self.sizes;
         let margin = (self.space.halves.mean - self.space.halves.before) as i64;
+        let Work { means, values, rows, sums, .. } = work;
         values.fill(f32::NEG_INFINITY);
+        let mut last = None;
         for Stencil { offset, weights: [across, along] } in &self.stencils {
             let [first_x, first_y] = offset.map(|offset| (offset + margin) as usize);
-            for (i, values) in values.chunks_exact_mut(before).enumerate() {
-                let line = |p: usize| &means[(i + first_x + p) * mean + first_y..][..before + 3];
-                let (a, b, c, d) = (line(0), line(1), line(2), line(3));
-                for (k, entry) in row.iter_mut().enumerate() {
-                    *entry =
-                        across[0] * a[k] + across[1] * b[k] + across[2] * c[k] + across[3] * d[k];
+            // Along all of W: the next push may have the same u_x.
+            if last.replace((first_x, across)) != Some((first_x, across)) {
+                for (i, row) in rows.chunks_exact_mut(wide_mean).enumerate() {
+                    let first = (i + first_x) * wide_mean;
+                    combine(row, mean, across, means, first, wide_mean);
                 }
-                let [a, b, c, d] = *along;
-                for (k, value) in values.iter_mut().enumerate() {
-                    let here = a * row[k] + b * row[k + 1] + c * row[k + 2] + d * row[k + 3];
-                    *value = if here > *value { here } else { *value };
+            }
+            for (i, values) in values.chunks_exact_mut(wide_before).enumerate() {
+                combine(sums, before, along, rows, i * wide_mean + first_y, 1);
+                let lanes = before.div_ceil(LANES);
+                let values = values.as_chunks_mut::<LANES>().0[..lanes].iter_mut();
+                for (values, here) in values.zip(sums.as_chunks::<LANES>().0) {
+                    for (value, &here) in values.iter_mut().zip(here) {
+                        *value = if here > *value { here } else { *value };
+                    }
                 }
             }
         }
@@ -399,49 +502,50 @@ impl Programme<'_> {
 
     /// From the lattice of v to velocities rho v+, into the column's part at y.
     #[inline(always)]
-    fn upsample(&self, values: &[f32], half: &mut [f32], y: usize, up: &mut [f32]) {
-        let Sizes { ny, before, plus, .. } = self.sizes;
-        for (row, half) in values.chunks_exact(before).zip(half.chunks_exact_mut(plus)) {
-            for (entry, (first, weights)) in half.iter_mut().zip(&self.upsampling) {
-                let nodes = &row[*first..][..4];
-                *entry = weights.iter().zip(nodes).map(|(w, v)| w * v).sum();
-            }
+    fn upsample(&self, work: &mut Work, y: usize, up: &mut [f32]) {
+        let Sizes { ny, before, plus, wide_plus, wide_before, .. } = self.sizes;
+        let Work { values, turned, half_up, half_turned, sums, .. } = work;
+        turn(values, [before, before], wide_before, turned, wide_before);
+        for ((first, weights), half) in
+            self.upsampling.iter().zip(half_up.chunks_exact_mut(wide_before))
+        {
+            combine(half, before, weights, turned, first * wide_before, wide_before);
         }
-        for (i, (first, w)) in self.upsampling.iter().enumerate() {
-            let line = |p: usize| &half[(first + p) * plus..][..plus];
-            let (a, b, c, d) = (line(0), line(1), line(2), line(3));
-            let up = &mut up[(i * ny + y) * plus..][..plus];
-            for (k, entry) in up.iter_mut().enumerate() {
-                *entry = w[0] * a[k] + w[1] * b[k] + w[2] * c[k] + w[3] * d[k];
-            }
+        turn(half_up, [plus, before], wide_before, half_turned, wide_plus);
+        for (i, (first, weights)) in self.upsampling.iter().enumerate() {
+            combine(sums, plus, weights, half_turned, first * wide_plus, wide_plus);
+            up[(i * ny + y) * plus..][..plus].copy_from_slice(&sums[..plus]);
         }
     }
 }
 
-/// W from Q: Gaussian smoothing along both axes, from `plus`^2 to `mean`^2 velocities.
+/// W from Q at y: Gaussian smoothing along both axes, from `plus`^2 to `mean`^2 velocities.
 #[inline(always)]
-pub fn smooth(
+fn smooth(
     outcomes: &[f32],
+    y: usize,
     kernel: &[f32],
-    plus: usize,
-    mean: usize,
+    sizes: Sizes,
     half: &mut [f32],
     means: &mut [f32],
 ) {
-    for (row, half) in outcomes.chunks_exact(plus).zip(half.chunks_exact_mut(mean)) {
-        half.fill(0.0);
-        for (m, weight) in kernel.iter().enumerate() {
-            for (entry, value) in half.iter_mut().zip(&row[m..]) {
-                *entry += weight * value;
-            }
-        }
+    let Sizes { mean, plus, wide_plus, wide_mean, .. } = sizes;
+    for (i, half) in half.chunks_exact_mut(wide_mean).enumerate() {
+        combine(half, mean, kernel, outcomes, (y * plus + i) * wide_plus, 1);
     }
-    for (i, row) in means.chunks_exact_mut(mean).enumerate() {
-        row.fill(0.0);
-        for (m, weight) in kernel.iter().enumerate() {
-            for (entry, value) in row.iter_mut().zip(&half[(i + m) * mean..][..mean]) {
-                *entry += weight * value;
-            }
-        }
+    for (i, row) in means.chunks_exact_mut(wide_mean).enumerate() {
+        combine(row, mean, kernel, half, i * wide_mean, wide_mean);
     }
+}
+
+/// W, on the square of nodes of vbar, from Q on that of v+.
+pub fn smoothed(space: &Space, outcomes: &[f32]) -> Vec<f32> {
+    let sizes = Sizes { ny: 1, ..Sizes::of(space) };
+    let Sizes { mean, plus, wide_plus, wide_mean, .. } = sizes;
+    let Work { outcomes: mut wide, mut half_smooth, mut means, .. } = Work::new(sizes);
+    for (row, outcomes) in wide.chunks_exact_mut(wide_plus).zip(outcomes.chunks_exact(plus)) {
+        row[..plus].copy_from_slice(outcomes);
+    }
+    smooth(&wide, 0, &space.kernel, sizes, &mut half_smooth, &mut means);
+    means.chunks_exact(wide_mean).flat_map(|row| &row[..mean]).copied().collect()
 }
