@@ -9,6 +9,7 @@
 //! | `perturbation/FAMILY/make` | one perturbation from its parameters |
 //! | `perturbation/FAMILY/learn` | likelihood ratio, score and entropy as well |
 //! | `rollout/WORLD` | one step of one of 250 episodes, recorded for both players |
+//! | `limit/WORLD/PLAYER` | the arithmetic of the next one alone, on registers: no program is faster |
 //! | `network/WORLD/PLAYER` | one sample of a minibatch: the networks' outputs and gradient |
 //! | `update/WORLD/PLAYER` | one sample of the rollout: critic, advantages, all epochs |
 //! | `train/WORLD` | all of it: Algorithm 1 with the antagonist active from the start |
@@ -27,7 +28,7 @@ use cvar_game::learn::family::Named;
 use cvar_game::learn::inputs::{Inputs, Selection};
 use cvar_game::learn::method::{Arena, Setting, Training};
 use cvar_game::learn::methods::game::GameTraining;
-use cvar_game::learn::network::Network;
+use cvar_game::learn::network::{Network, Shape};
 use cvar_game::learn::options::TrainOptions;
 use cvar_game::learn::pair::Pair;
 use cvar_game::learn::policy::Mode;
@@ -35,6 +36,7 @@ use cvar_game::learn::ppo::{Rates, Signal};
 use cvar_game::learn::rollout::{Collector, Terms};
 use lava_envs::random::{ChaCha8Rng, Purpose, stream};
 use lava_envs::{GaussianLaw, LavaGrid, LavaPoint, Law, Move, World};
+use pulp::{Arch, Simd, WithSimd};
 use rand::RngExt;
 use rand_distr::StandardNormal;
 use std::hint::black_box;
@@ -165,13 +167,20 @@ fn networks(criterion: &mut Criterion) {
 fn network<W: Arena>(criterion: &mut Criterion, (seen, suffix): (&str, &str)) {
     let name = format!("{}{suffix}", W::NAME);
     let options = seeing::<W>(seen);
-    let mut group = criterion.benchmark_group("network");
     let (mut pair, mut collector) = opening::<W>(&options);
     collector.collect(&pair, terms(), &options);
     let mut differentiate = |player, network: &mut Network, inputs: &Inputs, minibatch: usize| {
         let indices: Vec<usize> = (0..minibatch).collect();
         let samples = Selection { all: inputs.rows(), indices: &indices };
         let mut gradient = Vec::new();
+        let mut limits = criterion.benchmark_group("limit");
+        limits.throughput(Throughput::Elements(minibatch as u64));
+        let arithmetic = Arithmetic::of(network.shape(), minibatch);
+        limits.bench_function(BenchmarkId::new(&name, player), |bencher| {
+            bencher.iter(|| Arch::new().dispatch(arithmetic));
+        });
+        limits.finish();
+        let mut group = criterion.benchmark_group("network");
         group.throughput(Throughput::Elements(minibatch as u64));
         group.bench_function(BenchmarkId::new(&name, player), |bencher| {
             bencher.iter(|| {
@@ -186,6 +195,51 @@ fn network<W: Arena>(criterion: &mut Criterion, (seen, suffix): (&str, &str)) {
     let antagonist = pair.antagonist.as_mut().expect("eta is above 1");
     let (played, minibatch) = (&collector.antagonist.inputs, options.antagonist.minibatch);
     differentiate("antagonist", antagonist.network_mut(), played, minibatch);
+}
+
+/// The arithmetic of a minibatch's outputs and gradient.
+#[derive(Debug, Clone, Copy)]
+struct Arithmetic {
+    /// Multiplications with an addition, and what takes as long as one.
+    operations: usize,
+    divisions: usize,
+}
+
+impl Arithmetic {
+    fn of(shape: Shape, samples: usize) -> Self {
+        let units = 2 * shape.hidden;
+        // Both linear maps forwards and by their weights, and the second one backwards.
+        let linear = 2 * units * shape.width() + 3 * shape.rows() * shape.hidden;
+        // A cell's column, added forwards and backwards; tanh by a rational function, and its slope.
+        let cell = if shape.columns.cells > 0 { 2 * units } else { 0 };
+        let tanh = (13 + 2) * units;
+        Arithmetic { operations: samples * (linear + cell + tanh), divisions: samples * units }
+    }
+}
+
+impl WithSimd for Arithmetic {
+    type Output = ();
+
+    #[inline(always)]
+    fn with_simd<S: Simd>(self, simd: S) {
+        /// Enough of them in a row that none waits for another.
+        const SUMS: usize = 8;
+        let [divisions, operations] =
+            [self.divisions, self.operations].map(|all| all / S::F32_LANES);
+        let (a, b) = (simd.splat_f32s(black_box(0.999)), simd.splat_f32s(black_box(1e-3)));
+        let (mut quotients, mut sums) = ([a; 4], [b; SUMS]);
+        for _ in 0..divisions / 4 {
+            for quotient in &mut quotients {
+                *quotient = simd.div_f32s(*quotient, a);
+            }
+            for _ in 0..4 * operations / divisions / SUMS {
+                for sum in &mut sums {
+                    *sum = simd.mul_add_f32s(*sum, a, b);
+                }
+            }
+        }
+        black_box((quotients, sums));
+    }
 }
 
 /// The learning rate is 0: every update costs the same, and the players stay as they are.

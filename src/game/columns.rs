@@ -9,7 +9,7 @@ use pulp::{Arch, Simd, WithSimd};
 use std::f64::consts::LOG2_E;
 
 /// Samples of a column: a multiple of the width of any vector register.
-pub const SAMPLES: usize = 32;
+pub const SAMPLES: usize = 64;
 
 /// A number of each sample.
 pub type Column = [f64; SAMPLES];

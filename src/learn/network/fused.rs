@@ -76,16 +76,14 @@ fn load<'a>(samples: impl ExactSizeIterator<Item = &'a [f32]>, x: &mut [f32]) {
     }
 }
 
+/// Vectors of a tile.
+const VECTORS: usize = 4;
+
 /// How many of the remaining rows the next tile has: 16 registers hold the sums of two rows and what they are made
 /// of, 32 those of four.
 #[inline(always)]
 fn tile_rows<S: Simd>(remaining: usize) -> usize {
-    remaining.min(if few_registers::<S>() { 2 } else { 4 })
-}
-
-#[inline(always)]
-fn few_registers<S: Simd>() -> bool {
-    S::REGISTER_COUNT < 32
+    remaining.min(if S::REGISTER_COUNT < 32 { 2 } else { 4 })
 }
 
 /// What a sum and the number in its place become.
@@ -140,19 +138,17 @@ fn combine<S: Simd>(
     while row < rows {
         let tile = &mut out[row * vectors..];
         let weights = Weights { at: weights.at + row * weights.of_row, ..weights };
-        row += match (tile_rows::<S>(rows - row), few_registers::<S>()) {
-            (1, true) => combine_tile::<S, 1, 4>(simd, weights, terms, tile, finish),
-            (_, true) => combine_tile::<S, 2, 4>(simd, weights, terms, tile, finish),
-            (1, false) => combine_tile::<S, 1, 2>(simd, weights, terms, tile, finish),
-            (2, false) => combine_tile::<S, 2, 2>(simd, weights, terms, tile, finish),
-            (3, false) => combine_tile::<S, 3, 2>(simd, weights, terms, tile, finish),
-            (_, false) => combine_tile::<S, 4, 2>(simd, weights, terms, tile, finish),
+        row += match tile_rows::<S>(rows - row) {
+            1 => combine_tile::<S, 1>(simd, weights, terms, tile, finish),
+            2 => combine_tile::<S, 2>(simd, weights, terms, tile, finish),
+            3 => combine_tile::<S, 3>(simd, weights, terms, tile, finish),
+            _ => combine_tile::<S, 4>(simd, weights, terms, tile, finish),
         };
     }
 }
 
 #[inline(always)]
-fn combine_tile<S: Simd, const R: usize, const V: usize>(
+fn combine_tile<S: Simd, const R: usize>(
     simd: S,
     weights: Weights<'_>,
     terms: &[S::f32s],
@@ -161,10 +157,10 @@ fn combine_tile<S: Simd, const R: usize, const V: usize>(
 ) -> usize {
     let vectors = SAMPLES / S::F32_LANES;
     let out = &mut out[..R * vectors];
-    for vector in (0..vectors).step_by(V) {
-        let mut sums = [[simd.splat_f32s(0.0); V]; R];
+    for vector in (0..vectors).step_by(VECTORS) {
+        let mut sums = [[simd.splat_f32s(0.0); VECTORS]; R];
         for (term, of) in terms.chunks_exact(vectors).enumerate() {
-            let of = &of[vector..][..V];
+            let of = &of[vector..][..VECTORS];
             for (row, sums) in sums.iter_mut().enumerate() {
                 let at = weights.at + row * weights.of_row + term * weights.of_term;
                 let weight = simd.splat_f32s(weights.all[at]);
