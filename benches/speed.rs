@@ -9,7 +9,7 @@
 //! | `perturbation/FAMILY/make` | one perturbation from its parameters |
 //! | `perturbation/FAMILY/learn` | likelihood ratio, score and entropy as well |
 //! | `rollout/WORLD` | one step of one of 250 episodes, recorded for both players |
-//! | `limit/WORLD/PLAYER` | the arithmetic of the next one alone, on registers: no program is faster |
+//! | `limit/WORLD/PLAYER` | the arithmetic of the next one alone, on registers |
 //! | `network/WORLD/PLAYER` | one sample of a minibatch: the networks' outputs and gradient |
 //! | `update/WORLD/PLAYER` | one sample of the rollout: critic, advantages, all epochs |
 //! | `train/WORLD` | all of it: Algorithm 1 with the antagonist active from the start |

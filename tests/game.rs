@@ -236,6 +236,31 @@ fn check_draws<F: Family>(family: &F, law: F::Law, close: impl Fn(Outcome<F>, Ou
     }
 }
 
+/// The audit of draws in columns is that of single samples, where there is something to find: chances that do not sum
+/// to 1.
+#[test]
+fn the_audit_of_draws_finds_what_is_not_normalised() {
+    let (family, law) = (FiniteFamily::<4>, FiniteLaw { probabilities: [0.0, 0.2, 0.3, 0.4] });
+    let parameters = [[0.0; SAMPLES], [0.5; SAMPLES], [-0.5; SAMPLES], [2.0; SAMPLES]];
+    let budgets = [1.2, 1.5].map(budget);
+    let mut error = 0.0;
+    family.draw(Draws {
+        parameters: &parameters,
+        laws: &[law; 2],
+        budgets: &budgets,
+        random: &mut [ChaCha8Rng::seed_from_u64(1), ChaCha8Rng::seed_from_u64(2)].each_mut(),
+        nominal: false,
+        outcomes: &mut Vec::new(),
+        ratios: &mut [0.0; 2],
+        normalisation_error: Some(&mut error),
+    });
+    let single = |budget| {
+        family.perturbation(&parameters.map(|column| column[0]), &law, budget).normalisation_error()
+    };
+    let expected = budgets.map(single).into_iter().fold(0.0, f64::max);
+    assert!(expected > 0.01 && (error - expected).abs() < 1e-12, "{error}, {expected}");
+}
+
 type Outcome<F> = <<F as Family>::Law as Law>::Outcome;
 
 #[test]

@@ -51,7 +51,7 @@ pub trait Component: Copy + std::fmt::Debug + Send + 'static {
     /// + by_lost lost_entropy`.
     fn pull_back(&self, xi: Vector2<f64>, by: Gradient, gradient: &mut [f64]);
 
-    /// `E_P[delta^0_j]` - 1, evaluated in another way than the ratio itself; to 1e-12 of 1.
+    /// `E_P[delta^0_j]` - 1, evaluated in another way than the ratio itself.
     fn normalisation_error(&self) -> f64;
 }
 

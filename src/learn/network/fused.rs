@@ -1,11 +1,11 @@
 //! The network's passes on the processor: `SAMPLES` samples at a time, from the inputs to the gradient,
-//! without leaving the first-level cache.
+//! within the nearest caches.
 //!
 //! With so few inputs and outputs, general matrix products spend most of their time on packing, and
 //! every step of a whole minibatch through memory costs more than its arithmetic. A block holds its
 //! numbers sample by sample in rows: row i of `x` is input i of all its samples. Two loops make all sums:
-//! `combine` those over the terms of a linear map, `correlate` those over samples. What they load they use four
-//! times, in a tile of sums that stays in registers.
+//! `combine` those over the terms of a linear map, `correlate` those over samples. What they load they use
+//! several times, in a tile of sums that stays in registers.
 
 use super::{Outputs, Shape};
 use crate::game::columns::SAMPLES;
