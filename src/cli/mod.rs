@@ -13,6 +13,8 @@ mod verbs;
 use crate::experiment::registry::Registry;
 use anyhow::Result;
 use clap::Parser;
+use std::ffi::OsString;
+use std::path::Path;
 use std::process::ExitCode;
 
 /// Exit code of usage errors and bad input.
@@ -21,7 +23,16 @@ const BAD_INPUT: u8 = 2;
 /// The whole program, with the worlds and methods of a registry: reads the command line and carries it
 /// out.
 pub fn main(registry: &Registry) -> ExitCode {
-    exit_code(verbs::run(registry, args::Cli::parse()))
+    exit_code(verbs::run(registry, args::Cli::parse(), None))
+}
+
+/// The same for a program that another one hosts, such as an interpreter: its command line, which begins with
+/// the path that starts it again. Returns the exit code.
+pub fn hosted(registry: &Registry, command: &[OsString]) -> u8 {
+    let program = command.first().map(Path::new);
+    let code = exit_code(verbs::run(registry, args::Cli::parse_from(command), program));
+    // A code cannot be read, only compared.
+    (0..=u8::MAX).find(|&number| ExitCode::from(number) == code).unwrap_or(BAD_INPUT)
 }
 
 /// The exit code of a result; an error is reported in one line.

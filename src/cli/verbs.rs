@@ -30,19 +30,23 @@ use clap::CommandFactory;
 use std::collections::{BTreeMap, BTreeSet};
 use std::io::{self, BufWriter, IsTerminal};
 use std::num::NonZeroUsize;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::process::{Command, ExitCode};
 
 /// Exit code of a program whose runs have failed.
 const FAILED: u8 = 1;
 
-/// Carries out what the command line asks for.
+/// Carries out what the command line asks for. `program` is started again for workers; if `None`, this one.
 ///
 /// # Errors
 /// On bad input, before anything is overwritten.
-pub fn run(registry: &Registry, cli: Cli) -> Result<ExitCode> {
+pub fn run(registry: &Registry, cli: Cli, program: Option<&Path>) -> Result<ExitCode> {
+    let path = || match program {
+        Some(program) => Ok(program.to_owned()),
+        None => std::env::current_exe().context("the system does not tell this program's path"),
+    };
     match cli.verb {
-        Verb::Bench(args) => bench(registry, &args, &Stop::on_signals()?),
+        Verb::Bench(args) => bench(registry, &args, path()?, &Stop::on_signals()?),
         Verb::Train(args) => train(registry, &args, &Stop::on_signals()?),
         Verb::Evaluate(args) => evaluate(registry, &args),
         Verb::Rollout(args) => rollout(registry, &args),
@@ -51,7 +55,7 @@ pub fn run(registry: &Registry, cli: Cli) -> Result<ExitCode> {
         Verb::Figures(args) => figures(registry, &args),
         Verb::Report(args) => report(registry, &args.folder),
         Verb::Pack(args) => pack(&args),
-        Verb::Slurm(args) => slurm(registry, &args),
+        Verb::Slurm(args) => slurm(registry, &args, &path()?),
         Verb::Envs(args) => envs(registry, &args),
         Verb::Config(args) => config(registry, &args),
         Verb::Completions(args) => completions(&args),
@@ -64,7 +68,7 @@ pub fn run(registry: &Registry, cli: Cli) -> Result<ExitCode> {
     }
 }
 
-fn bench(registry: &Registry, args: &BenchArgs, stop: &Stop) -> Result<ExitCode> {
+fn bench(registry: &Registry, args: &BenchArgs, program: PathBuf, stop: &Stop) -> Result<ExitCode> {
     let options = args.device.map(device).into_iter().collect();
     let source = args.config.as_deref().map_or(Source::Quick, Source::File);
     let config = args.overrides.resolve(registry.catalogue(), source, options)?;
@@ -90,7 +94,7 @@ fn bench(registry: &Registry, args: &BenchArgs, stop: &Stop) -> Result<ExitCode>
         Some(jobs) => jobs,
         None => std::thread::available_parallelism().unwrap_or(NonZeroUsize::MIN),
     };
-    let outcome = sweep(&prepared, jobs, &Workers::of_this_program()?, stop);
+    let outcome = sweep(&prepared, jobs, &Workers::of(program), stop);
     let any_finished = outcome.finished + prepared.finished.len() > 0;
     let code = report_end(&outcome);
     if outcome.stopped.is_none() && args.only.is_none() && any_finished {
@@ -351,7 +355,7 @@ fn report_missing(figures: &report::figures::Figures) {
     }
 }
 
-fn slurm(registry: &Registry, args: &SlurmArgs) -> Result<ExitCode> {
+fn slurm(registry: &Registry, args: &SlurmArgs, program: &Path) -> Result<ExitCode> {
     let catalogue = registry.catalogue();
     let config = args.overrides.resolve(catalogue, Source::File(&args.config), Vec::new())?;
     let prepared = runner::prepare(catalogue, &config, &plan::runs(&config), &args.out)?;
@@ -366,9 +370,7 @@ fn slurm(registry: &Registry, args: &SlurmArgs) -> Result<ExitCode> {
         array_limit: args.array_limit,
         extra: args.extra.clone(),
     };
-    let program =
-        std::env::current_exe().context("the system does not tell this program's path")?;
-    let submit = slurm::write(&config, &runs, &args.out, &program, &options)
+    let submit = slurm::write(&config, &runs, &args.out, program, &options)
         .with_context(|| format!("cannot write to {}", args.out.display()))?;
     if !args.submit {
         let (count, submit) =

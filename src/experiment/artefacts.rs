@@ -50,6 +50,10 @@ pub struct Manifest {
     pub cores: Option<usize>,
     /// Wall-clock seconds of training.
     pub seconds: f64,
+    /// Wall-clock seconds of the evaluation and of the figures' data; `None` before it, and former versions
+    /// did not write it.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub evaluation_seconds: Option<f64>,
     /// Environment steps of training.
     pub steps: u64,
     /// What was not done as it was asked for, such as a number of steps that was rounded up.
@@ -72,6 +76,7 @@ impl Manifest {
             cpu: processor(),
             cores: std::thread::available_parallelism().ok().map(NonZeroUsize::get),
             seconds,
+            evaluation_seconds: None,
             steps,
             notes: Vec::new(),
             failure: None,

@@ -22,6 +22,7 @@ use crate::learn::method::{Arena, MethodEntry, Players};
 use crate::learn::policy::Mode;
 use crate::learn::weights;
 use lava_envs::{Scene, World};
+use std::any::Any;
 use std::io::{self, Write};
 use std::path::Path;
 use std::sync::LazyLock;
@@ -106,6 +107,11 @@ impl Registry {
         self.named(name).ok_or_else(|| RunError::UnknownWorld(name.to_owned()))
     }
 
+    /// The world `W` with its methods, if it is one of them.
+    pub fn entry<W: Arena + Solvable>(&self) -> Option<&WorldEntry<W>> {
+        self.worlds.iter().find_map(|world| (&**world as &dyn Any).downcast_ref())
+    }
+
     /// The world of a name, if there is one.
     pub fn named(&self, name: &str) -> Option<&dyn Entry> {
         self.worlds.iter().find(|world| world.name() == name).map(Box::as_ref)
@@ -135,7 +141,7 @@ impl Request<'_> {
 }
 
 /// A world with its methods, whatever their types.
-pub trait Entry: Send + Sync {
+pub trait Entry: Any + Send + Sync {
     /// The world's name.
     fn name(&self) -> &'static str;
 
@@ -261,7 +267,10 @@ impl<W: Arena> WorldEntry<W> {
     }
 
     /// The trained players of the finished run in `folder`.
-    fn load(&self, run: &RunConfig, folder: &Path) -> Result<Box<dyn Players<W>>, RunError> {
+    ///
+    /// # Errors
+    /// If the folder holds no weights of the run, or its method is none of this program.
+    pub fn load(&self, run: &RunConfig, folder: &Path) -> Result<Box<dyn Players<W>>, RunError> {
         let path = folder.join("final.safetensors");
         let bytes = read_at_most(&path, LARGEST_FILE).map_err(RunError::file(&path))?;
         require_own(&weights::about(&bytes)?, &run.id()).map_err(RunError::file(&path))?;

@@ -53,7 +53,7 @@ pub fn execute<W: Arena + Solvable>(
     {
         report(Report::Note("is trained; its weights are evaluated".to_owned()));
         let contestants = Contestants { run, constants, players: &*players, progress: &|| () };
-        return evaluate(&contestants, (manifest.steps, manifest.seconds), folder, stop, report);
+        return evaluate(&contestants, manifest, folder, stop, report);
     }
     let mut attempt = Attempt::begin(method, constants, run, &setting, folder, report)?;
     let trained = attempt.train(stop, report);
@@ -73,7 +73,7 @@ pub fn execute<W: Arena + Solvable>(
     write_in_place(&path, &players.weights(about)?).map_err(RunError::file(&path))?;
 
     let contestants = Contestants { run, constants, players, progress: &|| () };
-    evaluate(&contestants, (steps, seconds), folder, stop, report)
+    evaluate(&contestants, manifest, folder, stop, report)
 }
 
 /// Players with the manifest of their run.
@@ -113,15 +113,15 @@ fn trained_before<W: Arena>(
     Ok(Some((players, manifest)))
 }
 
-/// Evaluates the players of a run, trained for so many steps and seconds, and writes what is found.
+/// Evaluates the players of a run that is trained, and writes what is found and how long it took.
 fn evaluate<W: Arena + Solvable>(
     contestants: &Contestants<'_, W>,
-    (steps, seconds): (u64, f64),
+    mut manifest: Manifest,
     folder: &Path,
     stop: &Stop,
     report: &mut dyn FnMut(Report),
 ) -> Result<(), RunError> {
-    let run = contestants.run;
+    let (run, begun) = (contestants.run, Instant::now());
     // Those of the protocol, and those from which figures are drawn.
     let EvaluationOptions { episodes, figure_episodes, .. } = run.evaluation;
     let of = match contestants.players.opponent() {
@@ -147,7 +147,9 @@ fn evaluate<W: Arena + Solvable>(
     let path = folder.join(figure_data::FILE);
     let text = serde_json::to_vec(&shown).map_err(io::Error::other);
     text.and_then(|text| write_in_place(&path, &text)).map_err(RunError::file(&path))?;
-    let evaluation = Evaluation::new(&run.id(), (steps, seconds), found);
+    manifest.evaluation_seconds = Some(begun.elapsed().as_secs_f64());
+    write_json(&folder.join("manifest.json"), &manifest)?;
+    let evaluation = Evaluation::new(&run.id(), (manifest.steps, manifest.seconds), found);
     write_json(&folder.join("evaluation.json"), &evaluation)?;
     checkpoint::remove(folder).map_err(RunError::file(folder))
 }

@@ -69,16 +69,16 @@ const ONE: u64 = 0x3ff0_0000_0000_0000;
 /// The integer k nearest to x / log 2, exp(x - k log 2) - 1, and 2^k.
 #[inline(always)]
 fn reduced(x: f64) -> (f64, f64, f64) {
-    let rounded = x * LOG2_E + ROUND;
+    let rounded = x.mul_add(LOG2_E, ROUND);
     let k = rounded - ROUND;
-    let r = (x - k * LN_2[0]) - k * LN_2[1];
+    let r = k.mul_add(-LN_2[1], k.mul_add(-LN_2[0], x));
     let mut sum = FACTORIALS[0];
     let mut i = 1;
     while i < FACTORIALS.len() {
-        sum = sum * r + FACTORIALS[i];
+        sum = sum.mul_add(r, FACTORIALS[i]);
         i += 1;
     }
-    (k, sum * r * r + r, f64::from_bits((rounded.to_bits() << 52).wrapping_add(ONE)))
+    (k, (sum * r).mul_add(r, r), f64::from_bits((rounded.to_bits() << 52).wrapping_add(ONE)))
 }
 
 /// e^x to a relative error of 1e-15; beyond +-708 that at the bound. NaN stays NaN.
@@ -87,14 +87,14 @@ pub fn exp(x: f64) -> f64 {
     let x = if x < -708.0 { -708.0 } else { x };
     let x = if x > 708.0 { 708.0 } else { x };
     let (_, less_one, power) = reduced(x);
-    less_one * power + power
+    less_one.mul_add(power, power)
 }
 
 /// e^x - 1 to a relative error of 1e-15, for |x| <= 708 and no other.
 #[inline(always)]
 pub fn exp_m1(x: f64) -> f64 {
     let (k, less_one, power) = reduced(x);
-    if k == 0.0 { less_one } else { less_one * power + (power - 1.0) }
+    if k == 0.0 { less_one } else { less_one.mul_add(power, power - 1.0) }
 }
 
 /// log x of a normal positive number, to 1e-15 of the larger one of 1 and itself; of what is below the least
@@ -112,12 +112,12 @@ pub fn ln(x: f64) -> f64 {
     let mut sum = ODD[0];
     let mut i = 1;
     while i < ODD.len() {
-        sum = sum * square + ODD[i];
+        sum = sum.mul_add(square, ODD[i]);
         i += 1;
     }
     // 0, and NaN where x is not finite.
     let defect = x * 0.0;
-    k * LN_2[0] + (2.0 * s * sum + k * LN_2[1]) + defect
+    k.mul_add(LN_2[0], k.mul_add(LN_2[1], 2.0 * s * sum)) + defect
 }
 
 /// [`ln`] of each number, with the widest vectors.

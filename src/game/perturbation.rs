@@ -12,7 +12,7 @@ use lava_envs::Law;
 use rand::Rng;
 
 /// A parametric family of perturbations of one kind of law.
-pub trait Family: Clone + std::fmt::Debug {
+pub trait Family: Clone + std::fmt::Debug + Send {
     /// The nominal law it perturbs.
     type Law: Law;
     /// An admissible perturbation.

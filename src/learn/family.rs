@@ -72,7 +72,7 @@ struct Sizes<'a> {
 }
 
 /// A family that the options can select.
-pub trait Named: Family + Send + 'static {
+pub trait Named: Family + 'static {
     /// `train.family.kind`.
     const KIND: &'static str;
 
@@ -238,7 +238,7 @@ pub trait Antagonist<L: Law>: Debug + Send {
     fn restore(&mut self, state: PlayerState) -> Result<(), Unfit>;
 }
 
-impl<F: Family + Send + 'static> Antagonist<F::Law> for Player<AntagonistHead<F>> {
+impl<F: Family + 'static> Antagonist<F::Law> for Player<AntagonistHead<F>> {
     fn network(&self) -> &Network {
         &self.network
     }

@@ -23,7 +23,7 @@ use std::marker::PhantomData;
 ///
 /// The head's parameters are the actor's outputs followed by the head's constants, parameters that
 /// do not depend on the observation.
-pub trait Head: Clone + std::fmt::Debug {
+pub trait Head: Clone + std::fmt::Debug + Send {
     /// What the law depends on besides its parameters.
     type Given: Copy + std::fmt::Debug;
     /// What is chosen.

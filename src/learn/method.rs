@@ -7,13 +7,16 @@
 use super::device::Device;
 use super::family::Perturbed;
 use super::head::HeadOf;
+use super::inputs::Inputs;
+use super::observation::Observation;
 use super::options::TrainOptions;
-use super::policy::{Opponent, Policy};
+use super::policy::{Mode, Opponent, Policy};
 use super::state::Unfit;
 use super::weights::WeightsError;
 use crate::game::budget::Eta;
 use lava_envs::World;
 use lava_envs::action::{Action, ActionKind};
+use lava_envs::random::ChaCha8Rng;
 
 /// A world that can be trained in: its actions have a policy, its law of chance has a family of
 /// perturbations. Every world is one whose action and law are of a known kind.
@@ -154,12 +157,24 @@ pub trait Training<W: World> {
 }
 
 /// Trained players.
-pub trait Players<W: World> {
+pub trait Players<W: World>: Send {
     /// The protagonist.
     fn protagonist(&self) -> Box<dyn Policy<W> + '_>;
 
     /// The opponent that was trained with it, if there is one.
     fn opponent(&self) -> Option<Box<dyn Opponent<W> + '_>>;
+
+    /// What the players see; `None` where they do not look at the world through [`Observation`].
+    fn observation(&self) -> Option<Observation> {
+        None
+    }
+
+    /// The actions that the protagonist chooses for what it sees, a sample each; `None` where
+    /// [`Players::observation`] is.
+    fn act(&self, inputs: &Inputs, mode: Mode, random: &mut ChaCha8Rng) -> Option<Vec<W::Action>> {
+        let _ = (inputs, mode, random);
+        None
+    }
 
     /// All weights as the bytes of a safetensors file, with `about` in its header.
     ///

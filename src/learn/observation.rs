@@ -61,20 +61,32 @@ pub struct Observation {
 impl Observation {
     /// What the players of a game with these options see of a world.
     pub fn new<W: World>(world: &W, options: &TrainOptions, eta: Eta) -> Self {
+        let own = Self::of_view(world, options.observation, options.protagonist.time_aware, eta);
+        let antagonist_budget_scale = if options.hide_budget { 0.0 } else { own.budget_scale };
+        Observation {
+            antagonist_time: options.antagonist.time_aware,
+            critic_sees_game: options.critic_sees == CriticSees::Game,
+            antagonist_budget_scale,
+            ..own
+        }
+    }
+
+    /// What two players see who both see the time, or do not, and whose critics see the same.
+    pub fn of_view<W: World>(world: &W, view: View, time_aware: bool, eta: Eta) -> Self {
         let budget_scale = if eta.is_neutral() { 0.0 } else { 1.0 / eta.get().ln() };
-        let finite = match options.observation {
+        let finite = match view {
             View::Coordinates => None,
             View::Features => world.finite(),
         };
         Observation {
-            view: options.observation,
+            view,
             states: finite.map_or(0, |of| of.states()),
             actions: finite.map_or(0, |of| of.actions()),
-            protagonist_time: options.protagonist.time_aware,
-            antagonist_time: options.antagonist.time_aware,
-            critic_sees_game: options.critic_sees == CriticSees::Game,
+            protagonist_time: time_aware,
+            antagonist_time: time_aware,
+            critic_sees_game: false,
             budget_scale,
-            antagonist_budget_scale: if options.hide_budget { 0.0 } else { budget_scale },
+            antagonist_budget_scale: budget_scale,
         }
     }
 

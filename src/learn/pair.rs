@@ -14,7 +14,7 @@ use super::policy::{
 use super::ppo::Player;
 use super::weights::{self, Weights, WeightsError};
 use crate::game::columns::{Column, SAMPLES};
-use lava_envs::random::{Purpose, stream};
+use lava_envs::random::{ChaCha8Rng, Purpose, stream};
 use lava_envs::{Action, Law, World};
 
 /// The head of a world's protagonist.
@@ -107,6 +107,22 @@ impl<W: Arena> Players<W> for Pair<W> {
 
     fn opponent(&self) -> Option<Box<dyn Opponent<W> + '_>> {
         Some(Box::new(Pair::opponent(self, true)?))
+    }
+
+    fn observation(&self) -> Option<Observation> {
+        Some(self.observation)
+    }
+
+    fn act(&self, inputs: &Inputs, mode: Mode, random: &mut ChaCha8Rng) -> Option<Vec<W::Action>> {
+        let Player { head, network, .. } = &self.protagonist;
+        let (mut outputs, mut parameters) = (Vec::new(), Vec::new());
+        network.act(inputs.rows(), &mut outputs);
+        let samples = inputs.numbers.len() / network.shape().width();
+        let choose = |sample| {
+            self.protagonist.parameters_in(&outputs, sample, &mut parameters);
+            head.choose(&parameters, mode, random)
+        };
+        Some((0..samples).map(choose).collect())
     }
 
     fn weights(&self, about: String) -> Result<Vec<u8>, WeightsError> {

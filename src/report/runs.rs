@@ -39,6 +39,7 @@
 //! | `settings` | after them, where runs of one method, variant and world differ in their settings: the label |
 //! | `status` | `finished` or `failed` |
 //! | `steps`, `seconds` | environment steps and wall-clock seconds of training |
+//! | `evaluation_seconds` | wall-clock seconds of the evaluation and of the figures' data; left out where no run has them |
 //! | `greedy_mean`, `greedy_cvar` | mean and CVaR_alpha of the return J, greedy protagonist, nominal chance |
 //! | `greedy_lava`, `greedy_goal`, `greedy_timeout` | shares of its episodes that end so |
 //! | `greedy_cvar_0.04`, `greedy_cvar_0.01` | its CVaR at alpha = 0.04 and 0.01 |
@@ -155,6 +156,11 @@ impl Run {
         self.plays(Mode::Greedy, Chance::Nominal).find_map(|play| play.mean_clearance)
     }
 
+    /// Wall-clock seconds of the evaluation and of the figures' data.
+    pub fn evaluation_seconds(&self) -> Option<f64> {
+        self.manifest.as_ref()?.evaluation_seconds
+    }
+
     fn plays(&self, protagonist: Mode, chance: Chance) -> impl Iterator<Item = &Play> {
         let plays = self.evaluation.iter().flat_map(|evaluation| &evaluation.plays);
         plays.filter(move |play| play.protagonist == protagonist && play.chance == chance)
@@ -239,19 +245,12 @@ const METHOD_COLUMNS: [Column; 2] = [
 const SETTINGS_COLUMN: Column =
     ("settings", |of| Field::Text(of.run.label.clone().unwrap_or_default()));
 
-/// The columns of certificates that runs of former versions do not have; left out where no run has one.
-const LATER_COLUMNS: [Column; 4] = [
-    ("class_regret", |of| Field::Number(of.class_regret())),
-    ("response_gain", |of| Field::Number(of.exploitability().map(|of| of.response_gain))),
-    ("response_error", |of| Field::Number(of.exploitability().map(|of| of.response_error))),
-    ("exploitability", |of| Field::Number(of.exploitability().map(|of| of.epsilon))),
-];
-
-/// The column that they stand before.
-const AFTER_LATER_COLUMNS: &str = "budget_use";
+/// The columns that runs of former versions do not fill; left out where no run does.
+const LATER_COLUMNS: [&str; 5] =
+    ["evaluation_seconds", "class_regret", "response_gain", "response_error", "exploitability"];
 
 /// The other columns, in order.
-const COLUMNS: [Column; 31] = [
+const COLUMNS: [Column; 36] = [
     ("env", |of| Field::Text(of.run.name.world.clone())),
     ("eta", |of| Field::Text(of.run.name.eta.to_string())),
     ("seed", |of| Field::Count(Some(of.run.name.seed))),
@@ -260,6 +259,7 @@ const COLUMNS: [Column; 31] = [
     }),
     ("steps", |of| Field::Count(Some(of.run.steps))),
     ("seconds", |of| Field::Number(Some(of.run.seconds))),
+    ("evaluation_seconds", |of| Field::Number(of.run.evaluation_seconds())),
     ("greedy_mean", |of| mean(of.greedy)),
     ("greedy_cvar", |of| Field::Number(of.own_cvar(of.greedy))),
     ("greedy_lava", |of| share(of.greedy, End::Lava)),
@@ -292,6 +292,10 @@ const COLUMNS: [Column; 31] = [
     ("antagonist_gap_se", |of| {
         Field::Number(of.certificate.map(|of| of.antagonist_gap_standard_error))
     }),
+    ("class_regret", |of| Field::Number(of.class_regret())),
+    ("response_gain", |of| Field::Number(of.exploitability().map(|of| of.response_gain))),
+    ("response_error", |of| Field::Number(of.exploitability().map(|of| of.response_error))),
+    ("exploitability", |of| Field::Number(of.exploitability().map(|of| of.epsilon))),
     ("budget_use", |of| Field::Number(of.audit.map(|of| of.max_budget_use))),
     ("budget_violations", |of| Field::Count(of.audit.map(|of| of.violations))),
 ];
@@ -366,16 +370,11 @@ impl Runs {
 
     /// The text of `runs.csv`.
     pub fn to_csv(&self) -> String {
-        let mut columns = COLUMNS.to_vec();
-        let has_later = |run: &Run| {
-            let facts = Facts::of(run);
-            facts.class_regret().is_some() || facts.exploitability().is_some()
+        let filled = |get: fn(&Facts) -> Field| {
+            self.runs.iter().any(|run| !get(&Facts::of(run)).text().is_empty())
         };
-        if self.runs.iter().any(has_later) {
-            let place = columns.iter().position(|(name, _)| *name == AFTER_LATER_COLUMNS);
-            let place = place.expect("the columns have it");
-            columns.splice(place..place, LATER_COLUMNS);
-        }
+        let mut columns = COLUMNS.to_vec();
+        columns.retain(|(name, get)| !LATER_COLUMNS.contains(name) || filled(*get));
         if !self.are_plain() {
             columns.splice(1..1, METHOD_COLUMNS);
         }

@@ -168,9 +168,9 @@ fn improvement(group: &Group, baseline: Option<&Group>) -> Cell {
 }
 
 /// Mean over the runs of what their training took; runs of other programs do not say.
-fn cost(group: &Group, of: impl Fn(&Run) -> f64) -> Cell {
-    let values: Vec<f64> =
-        group.runs.iter().filter(|run| run.steps > 0 && run.seconds > 0.0).map(of).collect();
+fn cost(group: &Group, of: impl Fn(&Run) -> Option<f64>) -> Cell {
+    let told = group.runs.iter().filter(|run| run.steps > 0 && run.seconds > 0.0);
+    let values: Vec<f64> = told.filter_map(|run| of(run)).collect();
     estimate(statistics::mean(&values).map(|value| Estimate { value, interval: None }))
 }
 
@@ -188,10 +188,10 @@ fn violations(group: &Group) -> Option<u64> {
 
 /// Columns that results of former versions have no numbers for. CSV files leave them out where no row has
 /// one, so that those of such results stay as they are.
-const LATER: [&str; 3] = ["class_regret", "exploitability", "response_gain"];
+const LATER: [&str; 4] = ["class_regret", "exploitability", "response_gain", "evaluation_seconds"];
 
 /// The columns, in order. World, eta, alpha, seeds and failures stand before them in every format.
-pub static COLUMNS: [Column; 34] = [
+pub static COLUMNS: [Column; 35] = [
     Column {
         key: "mean",
         title: "mean",
@@ -525,7 +525,7 @@ pub static COLUMNS: [Column; 34] = [
         best: Best::None,
         meaning: "environment steps of training, mean over seeds",
         brief: "",
-        compute: |group, _| cost(group, |run| run.steps as f64),
+        compute: |group, _| cost(group, |run| Some(run.steps as f64)),
     },
     Column {
         key: "seconds",
@@ -535,7 +535,17 @@ pub static COLUMNS: [Column; 34] = [
         best: Best::None,
         meaning: "wall-clock seconds of training, mean over seeds",
         brief: "",
-        compute: |group, _| cost(group, |run| run.seconds),
+        compute: |group, _| cost(group, |run| Some(run.seconds)),
+    },
+    Column {
+        key: "evaluation_seconds",
+        title: "evaluation",
+        blocks: &[Block::Cost],
+        format: Format::Estimate(1),
+        best: Best::None,
+        meaning: "wall-clock seconds of the evaluation and of the figures' data, mean over seeds",
+        brief: "",
+        compute: |group, _| cost(group, Run::evaluation_seconds),
     },
     Column {
         key: "steps_per_second",
@@ -545,7 +555,7 @@ pub static COLUMNS: [Column; 34] = [
         best: Best::None,
         meaning: "environment steps per wall-clock second of training, mean over seeds",
         brief: "",
-        compute: |group, _| cost(group, |run| run.steps as f64 / run.seconds),
+        compute: |group, _| cost(group, |run| Some(run.steps as f64 / run.seconds)),
     },
 ];
 

@@ -50,15 +50,7 @@ pub struct Workers {
 const PATIENCE: Duration = Duration::from_secs(25);
 
 impl Workers {
-    /// Workers that run this program again, as `worker --folder DIR`.
-    ///
-    /// # Errors
-    /// If the system does not provide the program's path.
-    pub fn of_this_program() -> io::Result<Self> {
-        Ok(Workers::of(std::env::current_exe()?))
-    }
-
-    /// Workers that run another program in the same way.
+    /// Workers that run a program again, as `worker --folder DIR`.
     pub fn of(program: PathBuf) -> Self {
         Workers { program, patience: PATIENCE }
     }

@@ -236,6 +236,21 @@ const MOST_PIXELS: f64 = 4e7;
 /// # Errors
 /// If it is no SVG.
 pub fn png(svg: &str) -> Result<Vec<u8>, String> {
+    pixels(svg)?.encode_png().map_err(|error| error.to_string())
+}
+
+/// The SVG as red, green and blue of each pixel, shape `[height, width, 3]`, on white.
+///
+/// # Errors
+/// If it is no SVG.
+pub fn rgb(svg: &str) -> Result<(Vec<u8>, [usize; 3]), String> {
+    let pixels = pixels(svg)?;
+    // The picture's ground is white, so that every pixel is opaque.
+    let colours = pixels.pixels().iter().flat_map(|of| [of.red(), of.green(), of.blue()]).collect();
+    Ok((colours, [pixels.height() as usize, pixels.width() as usize, 3]))
+}
+
+fn pixels(svg: &str) -> Result<resvg::tiny_skia::Pixmap, String> {
     let options = resvg::usvg::Options { fontdb: Arc::clone(&FONTS), ..Default::default() };
     let tree = resvg::usvg::Tree::from_str(svg, &options).map_err(|error| error.to_string())?;
     let (width, height) = (tree.size().width(), tree.size().height());
@@ -245,5 +260,5 @@ pub fn png(svg: &str) -> Result<Vec<u8>, String> {
         resvg::tiny_skia::Pixmap::new(width, height).ok_or("the picture has no size")?;
     let transform = resvg::tiny_skia::Transform::from_scale(scale, scale);
     resvg::render(&tree, transform, &mut pixels.as_mut());
-    pixels.encode_png().map_err(|error| error.to_string())
+    Ok(pixels)
 }

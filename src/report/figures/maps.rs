@@ -208,6 +208,33 @@ pub(super) fn map(scene: &Scene) -> Option<(Picture, String)> {
     Some((picture, scene.rules.clone()))
 }
 
+/// The scene, where an episode went and where it is now: its last position. `None` if the scene is too large.
+pub fn moment(scene: &Scene, trail: &[[f64; 2]]) -> Option<Picture> {
+    let grid = Grid::of(scene);
+    if grid.is_none() && !is_drawable(scene) {
+        return None;
+    }
+    // A cell's position is its corner.
+    let middle = if scene.cells { 0.5 } else { 0.0 };
+    let unit = UNIT.min(LARGEST / scene.size[0].max(scene.size[1]));
+    let origin = Origin { x: 2, y: 2, unit };
+    let (width, height) = at(origin, scene.size[0], scene.size[1]);
+    figure((width as u32 + 2, height as u32 + 2), |canvas| {
+        match &grid {
+            Some(grid) => cells(canvas, grid, origin)?,
+            None => arena(canvas, scene, origin)?,
+        }
+        let line: Vec<(i32, i32)> =
+            trail.iter().map(|[x, y]| at(origin, x + middle, y + middle)).collect();
+        let now = line.last().copied();
+        canvas.draw(&PathElement::new(line, colour(0).mix(0.5).stroke_width(3)))?;
+        match now {
+            Some(now) => canvas.draw(&Circle::new(now, 9, colour(0).filled())),
+            None => Ok(()),
+        }
+    })
+}
+
 /// The data of a panel's seeds that are of cells.
 fn of_cells<'a>(panel: &'a Panel) -> impl Iterator<Item = &'a CellData> {
     panel.seeds.iter().filter_map(|(_, records)| match &records.figure_data.as_ref()?.world {

@@ -14,7 +14,8 @@ mod canvas;
 mod curves;
 mod maps;
 
-pub use canvas::{Picture, png};
+pub use canvas::{Picture, png, rgb};
+pub use maps::moment;
 
 use super::Worlds;
 use super::group::Group;
