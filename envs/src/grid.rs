@@ -175,6 +175,10 @@ pub struct Episode {
 pub struct LavaGrid {
     config: GridConfig,
     map: Map,
+    /// What each move leads to, by cell.
+    successors: Vec<[(usize, Step); MOVES]>,
+    /// The position in [-1, 1]^2, by cell.
+    scaled: Vec<[f32; 2]>,
     /// Distance to the nearest lava per cell, in moves.
     clearance: Vec<f64>,
     episodes: Vec<Episode>,
@@ -234,16 +238,7 @@ impl LavaGrid {
     /// What executing a move in a cell leads to, leaving the time limit aside. A goal or lava cell
     /// is absorbing and pays nothing.
     pub fn successor(&self, cell: usize, executed: Move) -> (usize, Step) {
-        if self.is_goal(cell) || self.is_lava(cell) {
-            return (cell, Step::IDLE);
-        }
-        let next = self.neighbour(cell, executed);
-        let step = match self.map.tile(next) {
-            Tile::Goal => Step { reward: self.config.goal_reward, end: Some(End::Goal) },
-            Tile::Lava => Step { reward: self.config.lava_reward, end: Some(End::Lava) },
-            Tile::Free | Tile::Wall => Step { reward: -self.config.step_cost, end: None },
-        };
-        (next, step)
+        self.successors[cell][executed.index()]
     }
 
     /// The nominal law of the executed move, which depends only on the chosen move.
@@ -257,23 +252,28 @@ impl LavaGrid {
         let (x, y) = self.map.coordinates(cell);
         [x as f64, y as f64]
     }
+}
 
-    fn neighbour(&self, cell: usize, executed: Move) -> usize {
-        let (x, y) = self.map.coordinates(cell);
-        let next = match executed {
-            Move::Up if y > 0 => cell - self.map.width(),
-            Move::Down if y + 1 < self.map.height() => cell + self.map.width(),
-            Move::Right if x + 1 < self.map.width() => cell + 1,
-            Move::Left if x > 0 => cell - 1,
-            _ => cell,
-        };
-        if self.map.tile(next) == Tile::Wall { cell } else { next }
+/// See [`LavaGrid::successor`].
+fn successor(config: &GridConfig, map: &Map, cell: usize, executed: Move) -> (usize, Step) {
+    if matches!(map.tile(cell), Tile::Goal | Tile::Lava) {
+        return (cell, Step::IDLE);
     }
-
-    fn scaled_position(&self, slot: usize) -> [f32; 2] {
-        let (x, y) = self.map.coordinates(self.episodes[slot].cell);
-        [scaled(x, self.map.width()), scaled(y, self.map.height())]
-    }
+    let (x, y) = map.coordinates(cell);
+    let next = match executed {
+        Move::Up if y > 0 => cell - map.width(),
+        Move::Down if y + 1 < map.height() => cell + map.width(),
+        Move::Right if x + 1 < map.width() => cell + 1,
+        Move::Left if x > 0 => cell - 1,
+        _ => cell,
+    };
+    let next = if map.tile(next) == Tile::Wall { cell } else { next };
+    let step = match map.tile(next) {
+        Tile::Goal => Step { reward: config.goal_reward, end: Some(End::Goal) },
+        Tile::Lava => Step { reward: config.lava_reward, end: Some(End::Lava) },
+        Tile::Free | Tile::Wall => Step { reward: -config.step_cost, end: None },
+    };
+    (next, step)
 }
 
 /// A coordinate 0..cells mapped onto [-1, 1]; 0 where there is one cell only.
@@ -328,8 +328,15 @@ impl World for LavaGrid {
     fn new(config: &GridConfig, episodes: usize) -> Result<Self, ConfigError> {
         let map = config.parse()?;
         let initial = Episode { cell: map.start(), time: 0, ended: false };
+        let successors = |cell| Move::ALL.map(|executed| successor(config, &map, cell, executed));
+        let position = |cell| {
+            let (x, y) = map.coordinates(cell);
+            [scaled(x, map.width()), scaled(y, map.height())]
+        };
         Ok(LavaGrid {
             config: config.clone(),
+            successors: (0..map.cells()).map(successors).collect(),
+            scaled: (0..map.cells()).map(position).collect(),
             clearance: clearance(&map),
             episodes: vec![initial; episodes],
             map,
@@ -376,7 +383,7 @@ impl World for LavaGrid {
     }
 
     fn observe(&self, slot: usize, observation: &mut [f32]) {
-        observation.copy_from_slice(&self.scaled_position(slot));
+        observation.copy_from_slice(&self.scaled[self.episodes[slot].cell]);
     }
 
     fn law(&self, _slot: usize, action: Move) -> FiniteLaw<MOVES> {
@@ -384,7 +391,7 @@ impl World for LavaGrid {
     }
 
     fn situation(&self, slot: usize, action: Move, situation: &mut [f32]) {
-        situation[..2].copy_from_slice(&self.scaled_position(slot));
+        situation[..2].copy_from_slice(&self.scaled[self.episodes[slot].cell]);
         for (entry, probability) in situation[2..].iter_mut().zip(self.law_of(action).probabilities)
         {
             *entry = probability as f32;

@@ -47,22 +47,65 @@ pub struct Stepped {
     pub reward: Vec<f64>,
     /// Whether the episode has ended.
     pub terminated: Vec<bool>,
-    /// How: 0 not yet, 1 goal, 2 lava, 3 time limit.
-    pub end: Vec<i64>,
-    /// What the protagonist saw before a reset of this step.
-    pub last_observation: Option<Vec<f32>>,
-    /// Distance to lava at the end of the step, before a reset.
+    /// Distance to lava now.
     pub clearance: Vec<f64>,
+    /// Slots in which an episode began, if there is one. Their [`Stepped::more`] is 0.
+    pub began: Option<Vec<bool>>,
+    /// What is told of the step.
+    pub more: More,
+    /// With [`Autoreset::SameStep`], what the ended episodes ended with, if one has; 0 in other slots.
+    pub last: Option<Last>,
+}
+
+/// What is told of a step.
+pub struct More {
+    /// How the episode has ended: 0 not yet, 1 goal, 2 lava, 3 time limit.
+    pub end: Vec<i64>,
     /// The realised outcomes.
     pub outcome: Values,
     /// Nominal probabilities of all outcomes, where they are finitely many.
     pub nominal: Option<Values>,
     /// Likelihood ratios of the outcomes.
     pub ratio: Vec<f64>,
-    /// Budgets after the step, before a reset.
+    /// Budgets after the step.
     pub budget: Vec<f64>,
-    /// Slots in which the step was a reset.
-    pub was_reset: Vec<bool>,
+}
+
+impl More {
+    /// Those of the slots that are to be kept, with 0 in the others.
+    fn only(&self, keep: impl Fn(usize) -> bool + Copy) -> More {
+        fn kept<T: Copy + Default>(
+            numbers: &[T],
+            width: usize,
+            keep: impl Fn(usize) -> bool,
+        ) -> Vec<T> {
+            let number = |(i, &number): (usize, &T)| {
+                if keep(i / width) { number } else { T::default() }
+            };
+            numbers.iter().enumerate().map(number).collect()
+        }
+        let values = |of: &Values| match of {
+            Values::Indices(indices) => Values::Indices(kept(indices, 1, keep)),
+            Values::Rows(rows, width) => Values::Rows(kept(rows, *width, keep), *width),
+        };
+        More {
+            end: kept(&self.end, 1, keep),
+            outcome: values(&self.outcome),
+            nominal: self.nominal.as_ref().map(values),
+            ratio: kept(&self.ratio, 1, keep),
+            budget: kept(&self.budget, 1, keep),
+        }
+    }
+}
+
+/// The ends of episodes that new ones have followed in the same step.
+pub struct Last {
+    /// What the protagonist saw at the end.
+    pub observation: Vec<f32>,
+    /// Distance to lava at the end.
+    pub clearance: Vec<f64>,
+    /// What is told of the last step.
+    pub more: More,
 }
 
 /// A batch of games.
@@ -342,44 +385,44 @@ impl<W: Playable> AnyGames for Games<W> {
         adversary.act(parameters, over.len(), |opponent| {
             game.step(&mut Chosen(&actions), Mode::Greedy, opponent, Draw::Perturbed);
         })?;
-        let was_reset = over.clone();
+        let waited = over.clone();
         let end = |end: Option<End>| match end {
             None => 0,
             Some(End::Goal) => 1,
             Some(End::Lava) => 2,
             Some(End::Timeout) => 3,
         };
-        let steps = game.steps.iter();
-        let mut stepped = Stepped {
-            observation: Vec::new(),
-            reward: steps.clone().map(|step| step.reward).collect(),
-            terminated: steps.clone().map(|step| step.end.is_some()).collect(),
+        let steps = self.game.steps.iter();
+        let reward = steps.clone().map(|step| step.reward).collect();
+        let terminated: Vec<bool> = steps.clone().map(|step| step.end.is_some()).collect();
+        let mut more = More {
             end: steps.map(|step| end(step.end)).collect(),
-            last_observation: None,
-            clearance: self.clearance(),
             outcome: W::Law::outcomes(&self.game.outcomes),
             nominal: W::Law::probabilities(&self.game.laws),
             ratio: self.game.ratios.clone(),
             budget: self.game.budgets.iter().map(|budget| budget.get()).collect(),
-            was_reset,
         };
-        for slot in 0..self.over.len() {
-            if stepped.was_reset[slot] {
+        self.over.copy_from_slice(&terminated);
+        let mut last = None;
+        let began = match autoreset {
+            Autoreset::SameStep => terminated.clone(),
+            Autoreset::NextStep | Autoreset::Disabled => waited,
+        };
+        let began = began.contains(&true).then_some(began);
+        if let Some(began) = &began {
+            if autoreset == Autoreset::SameStep {
+                let mut clearance = self.clearance();
+                clearance.iter_mut().zip(began).filter(|(_, ends)| !**ends).for_each(|(of, _)| *of = 0.0);
+                let observation = self.observe();
+                last = Some(Last { observation, clearance, more: more.only(|slot| began[slot]) });
+            }
+            more = more.only(|slot| !began[slot]);
+            for slot in (0..began.len()).filter(|&slot| began[slot]) {
                 self.start_next(slot);
-            } else {
-                self.over[slot] = stepped.terminated[slot];
             }
         }
-        if autoreset == Autoreset::SameStep && self.over.contains(&true) {
-            stepped.last_observation = Some(self.observe());
-            for slot in 0..self.over.len() {
-                if self.over[slot] {
-                    self.start_next(slot);
-                }
-            }
-        }
-        stepped.observation = self.observe();
-        Ok(stepped)
+        let (observation, clearance) = (self.observe(), self.clearance());
+        Ok(Stepped { observation, reward, terminated, clearance, began, more, last })
     }
 
     fn snapshot(&self, slot: usize) -> Vec<u8> {

@@ -21,7 +21,7 @@ use cvar_game::learn::options::{FamilyOptions, View};
 use cvar_game::learn::policy::Mode;
 use cvar_game::report::figures::{moment, rgb};
 use cvar_game::report::runs::Runs;
-use games::{AnyGames, Autoreset, Setup};
+use games::{AnyGames, Autoreset, More, Setup, Stepped};
 use law::Law;
 use numpy::{
     IntoPyArray, PyArray1, PyArray2, PyArrayMethods, PyReadonlyArray2, PyReadonlyArrayDyn,
@@ -476,7 +476,7 @@ impl Games {
         matrix(py, observation, self.observation_size)
     }
 
-    /// One step: observation, reward, terminated and a dictionary of all else.
+    /// One step, as Gymnasium's vector environments return it: observation, reward, terminated, truncated, infos.
     #[pyo3(signature = (actions, parameters=None))]
     #[expect(clippy::type_complexity, reason = "it is what Gymnasium returns")]
     fn step<'py>(
@@ -488,35 +488,43 @@ impl Games {
         Bound<'py, PyArray2<f32>>,
         Bound<'py, PyArray1<f64>>,
         Bound<'py, PyArray1<bool>>,
+        Bound<'py, PyArray1<bool>>,
         Bound<'py, PyDict>,
     )> {
         let actions = Values::of_actions(actions, self.actions)?;
         let parameters: Option<Vec<f32>> =
             parameters.map(|array| array.as_array().iter().copied().collect());
-        let stepped =
-            py.detach(|| lock(&self.games).step(&actions, parameters.as_deref(), self.autoreset));
-        let stepped = valid(stepped)?;
-        let more = PyDict::new(py);
-        more.set_item("end", stepped.end.into_pyarray(py))?;
-        more.set_item("clearance", stepped.clearance.into_pyarray(py))?;
-        more.set_item("outcome", stepped.outcome)?;
-        if let Some(nominal) = stepped.nominal {
-            more.set_item("nominal", nominal)?;
+        let stepped = py.detach(|| {
+            lock(&self.games).step(&actions, parameters.as_deref(), self.autoreset)
+        });
+        let Stepped { observation, reward, terminated, clearance, began, more, last } =
+            valid(stepped)?;
+        let infos = PyDict::new(py);
+        if let Some(last) = last {
+            let ended = terminated.clone().into_pyarray(py);
+            let observation = matrix(py, last.observation, self.observation_size)?;
+            let ends = PyDict::new(py);
+            tell(&ends, "clearance", last.clearance.into_pyarray(py), &ended)?;
+            last.more.tell(&ends, &ended)?;
+            tell(&infos, "final_obs", observation, &ended)?;
+            tell(&infos, "final_info", ends, &ended)?;
         }
-        more.set_item("likelihood_ratio", stepped.ratio.into_pyarray(py))?;
-        more.set_item("budget", stepped.budget.into_pyarray(py))?;
-        if let Some(last) = stepped.last_observation {
-            more.set_item("final_obs", matrix(py, last, self.observation_size)?)?;
+        let all = vec![true; self.slots].into_pyarray(py);
+        tell(&infos, "clearance", clearance.into_pyarray(py), &all)?;
+        match began {
+            None => more.tell(&infos, &all)?,
+            Some(began) if !began.contains(&false) => {} // nobody made a step
+            Some(mut began) => {
+                began.iter_mut().for_each(|of| *of = !*of);
+                more.tell(&infos, &began.into_pyarray(py))?;
+            }
         }
-        if stepped.was_reset.contains(&true) {
-            more.set_item("was_reset", stepped.was_reset.into_pyarray(py))?;
-        }
-        let observation = matrix(py, stepped.observation, self.observation_size)?;
         Ok((
-            observation,
-            stepped.reward.into_pyarray(py),
-            stepped.terminated.into_pyarray(py),
-            more,
+            matrix(py, observation, self.observation_size)?,
+            reward.into_pyarray(py),
+            terminated.into_pyarray(py),
+            vec![false; self.slots].into_pyarray(py),
+            infos,
         ))
     }
 
@@ -565,6 +573,34 @@ impl Games {
             return Err(invalid(format!("there is no slot {slot}")));
         }
         valid(py.detach(|| lock(&self.games).restore(slot, snapshot)))
+    }
+}
+
+/// An entry of the infos of a vector environment, and the mask of the slots that it is of.
+fn tell<'py>(
+    infos: &Bound<'py, PyDict>,
+    key: &str,
+    values: impl IntoPyObject<'py>,
+    mask: &Bound<'py, PyArray1<bool>>,
+) -> PyResult<()> {
+    infos.set_item(key, values)?;
+    infos.set_item(format!("_{key}"), mask)
+}
+
+impl More {
+    fn tell<'py>(
+        self,
+        infos: &Bound<'py, PyDict>,
+        mask: &Bound<'py, PyArray1<bool>>,
+    ) -> PyResult<()> {
+        let py = infos.py();
+        tell(infos, "outcome", self.outcome, mask)?;
+        if let Some(nominal) = self.nominal {
+            tell(infos, "nominal", nominal, mask)?;
+        }
+        tell(infos, "likelihood_ratio", self.ratio.into_pyarray(py), mask)?;
+        tell(infos, "budget", self.budget.into_pyarray(py), mask)?;
+        tell(infos, "end", self.end.into_pyarray(py), mask)
     }
 }
 

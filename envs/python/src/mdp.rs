@@ -14,7 +14,7 @@ use crate::{budget, discount, invalid, valid};
 use cvar_game::exact::ExactError;
 use cvar_game::exact::antagonist;
 use cvar_game::exact::chow::Chow;
-use cvar_game::exact::law::{evaluate, evaluate_under};
+use cvar_game::exact::law::{Perturbation, evaluate, evaluate_under};
 use cvar_game::exact::mdp::{FiniteMdp, MAX_NODES, Node, Outcome, State};
 use cvar_game::exact::optimum;
 use cvar_game::exact::policy::Policy;
@@ -37,6 +37,9 @@ const MAX_MASSES: usize = 100_000_000;
 
 /// The largest reward, so that no sum of rewards overflows.
 const LARGEST_REWARD: f64 = 1e100;
+
+/// A tail of less probability counts as out of reach: its reciprocal would be no number soon.
+const LEAST_TAIL: f64 = 1e-200;
 
 /// How far the sum of a law may be from 1. Decimals in files are rounded; such laws are normalised.
 const SUM_TOLERANCE: f64 = 1e-6;
@@ -328,8 +331,7 @@ fn outcomes(transitions: &Transitions, states: usize) -> Result<Vec<Vec<Vec<Seen
     for i in 0..count {
         let at = |problem: String| format!("transition {i}: {problem}");
         let from = in_range("state", state[i], states).map_err(at)?;
-        // A state has no more actions than there are transitions.
-        let chosen = in_range("action", action[i], count).map_err(at)?;
+        let chosen = in_range("action", action[i], MAX_NODES).map_err(at)?;
         let to = match next[i] {
             -1 => None,
             next => Some(
@@ -732,72 +734,88 @@ impl Optimum {
     }
 }
 
+/// The likelihood ratios of a worst case, as those of [`antagonist::WorstCase`]: of the probability of the tail
+/// after a step to that before it.
+struct Tail {
+    model: Arc<Model>,
+    /// The solver's return at which the tail ends, and which share of that return belongs to it.
+    threshold: f64,
+    share: f64,
+    /// Probabilities of the tail, by place.
+    probabilities: Vec<f64>,
+}
+
+impl Tail {
+    fn new(model: &Arc<Model>, worst: &antagonist::WorstCase<'_>) -> Self {
+        let mdp = &model.mdp;
+        let mut probabilities = Vec::with_capacity(model.blocks[mdp.horizon()] * mdp.states());
+        for time in 0..mdp.horizon() {
+            for level in 0..mdp.accumulated(time).len() {
+                for state in 0..mdp.states() {
+                    probabilities.push(worst.tail_probability(Node { time, level, state }));
+                }
+            }
+        }
+        let (threshold, share) = (worst.threshold(), worst.share());
+        Tail { model: Arc::clone(model), threshold, share, probabilities }
+    }
+
+    /// Its probability; 0 where it is too small to divide by.
+    fn at(&self, node: Node) -> f64 {
+        let probability = self.probabilities[self.model.place(node)];
+        if probability < LEAST_TAIL { 0.0 } else { probability }
+    }
+}
+
+impl Perturbation for Tail {
+    fn ratio(&self, node: Node, action: usize, outcome: usize) -> f64 {
+        let mdp = &self.model.mdp;
+        let before = self.at(node);
+        if before == 0.0 {
+            return 1.0;
+        }
+        let after = match (mdp.successor(node, action, outcome), mdp.ending(node, action, outcome))
+        {
+            (Some(next), _) => self.at(next),
+            (None, Some((_, value))) if value < self.threshold => 1.0,
+            (None, Some((_, value))) if value == self.threshold => self.share,
+            _ => 0.0,
+        };
+        after / before
+    }
+}
+
 /// The worst that chance can do to a deterministic policy within a budget.
 #[pyclass(frozen, module = "cvar_game._core")]
 pub struct MdpWorstCase {
-    model: Arc<Model>,
+    tail: Tail,
     policy: Policy,
     eta: Eta,
     /// The value of the game.
     value: f64,
-    /// The solver's return at which the tail ends, and which share of that return belongs to it.
-    threshold: f64,
-    share: f64,
-    /// The probability of the tail, by place.
-    tail: Vec<f64>,
     /// The law of the return if chance does its worst.
     law: Law,
 }
 
 impl MdpWorstCase {
     fn new(model: &Arc<Model>, policy: Policy, eta: Eta) -> Result<Self, String> {
-        let mdp = &model.mdp;
-        let worst = antagonist::WorstCase::new(mdp, &policy, eta.get())
-            .map_err(|error| error.to_string())?;
-        let law = model.law(&evaluate_under(mdp, &policy, &worst).law);
-        let mut tail = Vec::with_capacity(model.blocks[mdp.horizon()] * mdp.states());
-        for time in 0..mdp.horizon() {
-            for level in 0..mdp.accumulated(time).len() {
-                for state in 0..mdp.states() {
-                    tail.push(worst.tail_probability(Node { time, level, state }));
-                }
-            }
-        }
-        let (value, threshold, share) =
-            (worst.value() - model.offset, worst.threshold(), worst.share());
-        Ok(MdpWorstCase {
-            model: Arc::clone(model),
-            policy,
-            eta,
-            value,
-            threshold,
-            share,
-            tail,
-            law,
-        })
+        let worst = antagonist::WorstCase::new(&model.mdp, &policy, eta.get());
+        let worst = worst.map_err(|error| error.to_string())?;
+        let tail = Tail::new(model, &worst);
+        let law = model.law(&evaluate_under(&model.mdp, &policy, &tail).law);
+        Ok(MdpWorstCase { tail, policy, eta, value: worst.value() - model.offset, law })
     }
 
-    /// The likelihood ratio of an outcome of the policy's action, as [`antagonist::WorstCase::delta`].
-    fn delta(&self, node: Node, action: usize, outcome: usize) -> f64 {
-        let mdp = &self.model.mdp;
-        let tail = self.tail[self.model.place(node)];
-        if tail == 0.0 {
-            return 1.0;
-        }
-        let after = match (mdp.successor(node, action, outcome), mdp.ending(node, action, outcome))
-        {
-            (Some(next), _) => self.tail[self.model.place(next)],
-            (None, Some((_, value))) if value < self.threshold => 1.0,
-            (None, Some((_, value))) if value == self.threshold => self.share,
-            _ => 0.0,
-        };
-        after / tail
+    fn model(&self) -> &Model {
+        &self.tail.model
     }
 
+    /// The likelihood ratios of the policy's action.
     fn deltas(&self, node: Node) -> impl Iterator<Item = f64> + '_ {
-        let action = self.policy.action(&self.model.mdp, node);
-        let outcomes = self.model.mdp.outcome_count(node.state, action);
-        (0..outcomes).map(move |outcome| self.delta(node, action, outcome))
+        let mdp = &self.model().mdp;
+        let action = self.policy.action(mdp, node);
+        let outcomes = mdp.outcome_count(node.state, action);
+        (0..outcomes).map(move |outcome| self.tail.ratio(node, action, outcome))
     }
 }
 
@@ -818,7 +836,7 @@ impl MdpWorstCase {
     /// The return at which the tail ends: the VaR of the policy at alpha = 1/eta.
     #[getter]
     fn threshold(&self) -> f64 {
-        self.threshold - self.model.offset
+        self.tail.threshold - self.model().offset
     }
 
     /// The law of the return if chance does its worst.
@@ -829,12 +847,13 @@ impl MdpWorstCase {
 
     /// The likelihood ratios of the states in which an episode may start, shape `[S]`; 1 in other states.
     fn start_ratios<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray1<f64>> {
-        let (model, mdp) = (&self.model, &self.model.mdp);
+        let (model, mdp) = (self.model(), &self.model().mdp);
         let mut ratios = vec![1.0; model.states()];
         if model.shift == 1 {
             let start = mdp.start_node();
             for outcome in 0..mdp.outcome_count(start.state, 0) {
-                ratios[mdp.outcome(start.state, 0, outcome).next] = self.delta(start, 0, outcome);
+                ratios[mdp.outcome(start.state, 0, outcome).next] =
+                    self.tail.ratio(start, 0, outcome);
             }
         }
         ratios.into_pyarray(py)
@@ -842,8 +861,8 @@ impl MdpWorstCase {
 
     /// The policy's action.
     fn action(&self, time: i64, accumulated: f64, state: i64) -> PyResult<usize> {
-        let node = valid(self.model.node(time, accumulated, state))?;
-        Ok(self.policy.action(&self.model.mdp, node))
+        let node = valid(self.model().node(time, accumulated, state))?;
+        Ok(self.policy.action(&self.model().mdp, node))
     }
 
     /// The likelihood ratios of the outcomes of the policy's action, shape `[K]`, in the order of `Mdp.outcomes`.
@@ -854,19 +873,19 @@ impl MdpWorstCase {
         accumulated: f64,
         state: i64,
     ) -> PyResult<Bound<'py, PyArray1<f64>>> {
-        let node = valid(self.model.node(time, accumulated, state))?;
+        let node = valid(self.model().node(time, accumulated, state))?;
         Ok(PyArray1::from_iter(py, self.deltas(node)))
     }
 
     /// The budget that is left there; infinite where the tail is out of reach.
     fn budget(&self, time: i64, accumulated: f64, state: i64) -> PyResult<f64> {
-        let node = valid(self.model.node(time, accumulated, state))?;
-        Ok(1.0 / self.tail[self.model.place(node)])
+        let node = valid(self.model().node(time, accumulated, state))?;
+        Ok(1.0 / self.tail.at(node))
     }
 
     /// The likelihood ratios by time, state and outcome, shape `[T, S, K]`; 1 where there is no outcome.
     fn table<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyArray3<f64>>> {
-        let model = &self.model;
+        let model = self.model();
         model.needs_one_level()?;
         let width = model.outcomes.iter().flatten().map(Vec::len).max().unwrap_or(0);
         let size = model.horizon().saturating_mul(model.states()).saturating_mul(width);

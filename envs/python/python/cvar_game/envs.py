@@ -148,15 +148,10 @@ class LavaEnv(gym.Env[Array, Any]):
         if not self._open:
             raise ValueError("reset() the environment first; a closed one cannot be stepped")
         actions = as_actions(np.asarray(action)[None], self.world.actions, 1)
-        observation, reward, terminated, more = self._games.step(actions)
+        observation, reward, terminated, _, infos = self._games.step(actions)
         self._follow()
-        info: dict[str, Any] = {"clearance": float(more["clearance"][0])}
-        info["outcome"] = more["outcome"][0]
-        if "nominal" in more:
-            info["nominal"] = more["nominal"][0]
-        info["likelihood_ratio"] = float(more["likelihood_ratio"][0])
-        info["budget"] = float(more["budget"][0])
-        info["end"] = int(more["end"][0])
+        info = {key: values[0] for key, values in infos.items() if key[0] != "_"}
+        info |= {key: info[key].item() for key in ("clearance", "likelihood_ratio", "budget", "end")}
         return observation[0], float(reward[0]), bool(terminated[0]), False, info
 
     def render(self) -> Any:
@@ -286,48 +281,13 @@ class LavaVectorEnv(gym.vector.VectorEnv[Array, Any, Array]):
         if self.closed or not self._seeded:
             raise ValueError("reset() the environment first; a closed one cannot be stepped")
         chosen = as_actions(actions, self.world.actions, self.num_envs)
-        observation, reward, terminated, more = self._games.step(chosen)
-        infos = self._infos(terminated, more)
-        return observation, reward, terminated, np.zeros(self.num_envs, np.bool_), infos
-
-    def _infos(self, terminated: Array, more: dict[str, Any]) -> dict[str, Any]:
-        was_reset = more.pop("was_reset", None)
-        final_obs = more.pop("final_obs", None)
-        infos: dict[str, Any] = {}
-        restarted = np.zeros(self.num_envs, np.bool_)
-        if final_obs is not None:
-            infos = self._final(terminated, final_obs, more)
-            restarted = terminated
-        elif was_reset is not None:
-            restarted = was_reset
-        any_restarted = final_obs is not None or was_reset is not None
-        if any_restarted:
-            more["clearance"] = self._games.clearance()
-        self._follow(restarted, moved=True)
-        for key, values in more.items():
-            if key == "clearance" or not any_restarted:
-                infos[key], infos[f"_{key}"] = values, np.ones(self.num_envs, np.bool_)
-            elif not restarted.all():
-                # A slot that was reset has no step to tell of.
-                values[restarted] = 0
-                infos[key], infos[f"_{key}"] = values, ~restarted
-        return infos
-
-    def _final(self, ended: Array, final_obs: Array, more: dict[str, Any]) -> dict[str, Any]:
-        observations = np.full(self.num_envs, None, dtype=object)
-        for slot in np.flatnonzero(ended):
-            observations[slot] = final_obs[slot].copy()
-        info: dict[str, Any] = {}
-        for key, values in more.items():
-            last = values.copy()
-            last[~ended] = 0
-            info[key], info[f"_{key}"] = last, ended.copy()
-        return {
-            "final_obs": observations,
-            "_final_obs": ended.copy(),
-            "final_info": info,
-            "_final_info": ended.copy(),
-        }
+        stepped = self._games.step(chosen)
+        observation, reward, terminated, truncated, infos = stepped
+        if "final_obs" in infos:
+            infos["final_obs"] = _each(infos["final_obs"], terminated)
+        if self.render_mode is not None:
+            self._follow(restarted=~infos.get("_end", np.zeros(self.num_envs, np.bool_)), moved=True)
+        return observation, reward, terminated, truncated, infos
 
     def render(self) -> tuple[Any, ...] | None:
         """A frame per slot, as that of :class:`LavaEnv`."""
@@ -368,6 +328,14 @@ class LavaVectorEnv(gym.vector.VectorEnv[Array, Any, Array]):
                 self._trails[slot].clear()
             if restarted[slot] or moved:
                 self._trails[slot].append(position)
+
+
+def _each(rows: Array, ended: Array) -> Array:
+    """The rows of some slots, each an array of its own; ``None`` in the others."""
+    each = np.full(len(rows), None, dtype=object)
+    for slot in np.flatnonzero(ended):
+        each[slot] = rows[slot].copy()
+    return each
 
 
 def _seed(seed: int) -> int:

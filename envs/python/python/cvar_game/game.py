@@ -152,11 +152,11 @@ class LavaGame(AECEnv[str, Array, Any]):
                 f"{parameters.shape}"
             )
         parameters = np.ascontiguousarray(parameters[None], dtype=np.float32)
-        sight, reward, terminated, more = self._games.step(self._chosen, parameters)
+        sight, reward, terminated, _, infos = self._games.step(self._chosen, parameters)
         self._sights[PROTAGONIST] = sight[0]
         self.rewards = {PROTAGONIST: float(reward[0]), ANTAGONIST: -float(reward[0])}
         self.terminations = dict.fromkeys(self.agents, bool(terminated[0]))
-        info = {key: values[0] for key, values in more.items()}
+        info = {key: values[0] for key, values in infos.items() if key[0] != "_"}
         self.infos = {of: dict(info) for of in self.agents}
         self.agent_selection = PROTAGONIST
         self._trail.append(self._games.positions()[0])

@@ -160,7 +160,9 @@ class FiniteMDP:
         ids = rows[:, :3].astype(np.int64)
         self._rows = rows
         self._core = Mdp(
-            *(np.ascontiguousarray(ids[:, column]) for column in range(3)),
+            np.ascontiguousarray(ids[:, 0]),
+            np.ascontiguousarray(ids[:, 1]),
+            np.ascontiguousarray(ids[:, 2]),
             np.ascontiguousarray(rows[:, 3]),
             np.ascontiguousarray(rows[:, 4]),
             states=count,
@@ -242,20 +244,9 @@ class FiniteMDP:
             OSError: If the file cannot be read.
         """
         rows, lines = _read_csv(path)
-        for columns, name in (([0, 2], "states"), ([1], "actions")):
-            least = rows[:, columns].min()
-            if least not in (0.0, 1.0):
-                raise ValueError(f"{path}: the ids of {name} must start at 0 or 1, got {least:.0f}")
-            rows[:, columns] -= least
-        sums: dict[tuple[float, float], tuple[float, int]] = {}
-        for (state, action, _, probability, _), line in zip(rows.tolist(), lines, strict=True):
-            total, first = sums.get((state, action), (0.0, line))
-            sums[state, action] = (total + probability, first)
-        for total, first in sums.values():
-            if abs(total - 1.0) > 1e-6:
-                raise ValueError(
-                    f"{path}, line {first}: the probabilities of this state and action sum to {total}, not to 1"
-                )
+        _check_csv(path, rows, lines)
+        rows[:, [0, 2]] -= rows[:, [0, 2]].min()
+        rows[:, 1] -= rows[:, 1].min()
         return cls(rows, horizon=horizon, gamma=gamma, start=start)
 
     @property
@@ -477,6 +468,8 @@ def admissible(ratios: npt.ArrayLike, probabilities: npt.ArrayLike, budget: floa
         raise ValueError(f"likelihood ratios must be finite and not negative, got {ratio}")
     if not 1.0 <= budget < np.inf:
         raise ValueError(f"a budget must be a finite number of at least 1, got {budget}")
+    if budget == 1.0:
+        return np.ones_like(law)
     possible = law > 0.0
     largest = ratio[possible].max(initial=0.0)
     if largest == 0.0:
@@ -520,7 +513,10 @@ class _Fixed:
 if TYPE_CHECKING:
 
     class BudgetedAntagonist(gymnasium.Wrapper[Any, Any, Any, Any]):
-        """A budgeted antagonist in a toy-text environment; see the documentation of the module's class."""
+        """Puts a budgeted antagonist between an environment of Gymnasium's toy text and an agent."""
+
+        eta: float
+        """Budget."""
 
         def __init__(
             self,
@@ -731,7 +727,7 @@ def _table_rows(inner: Any) -> tuple[list[tuple[float, float, float, float, floa
         )
     if getattr(inner, "fickle_passenger", False):
         raise ValueError("the environment's table P leaves out the fickle passenger; make it without one")
-    rows = []
+    rows: list[tuple[float, float, float, float, float]] = []
     for state in range(len(table)):
         try:
             actions = table[state]
@@ -753,7 +749,7 @@ def _read_csv(path: str | os.PathLike[str]) -> tuple[Floats, list[int]]:
     rows: list[list[float]] = []
     lines: list[int] = []
     with open(path, newline="", encoding="utf-8-sig") as file:
-        reader = csv.reader(file)
+        reader = csv.reader(file, strict=True)
         try:
             header = [name.strip().lower() for name in next(reader, [])]
             missing = [name for name in COLUMNS if name not in header]
@@ -770,6 +766,30 @@ def _read_csv(path: str | os.PathLike[str]) -> tuple[Floats, list[int]]:
     if not rows:
         raise ValueError(f"{path} has no transitions")
     return np.array(rows, dtype=np.float64), lines
+
+
+def _check_csv(path: str | os.PathLike[str], rows: Floats, lines: list[int]) -> None:
+    """Refuses what only several lines together say, in the file's own ids."""
+    for columns, name in (([0, 2], "states"), ([1], "actions")):
+        least = int(rows[:, columns].min())
+        if least not in (0, 1):
+            raise ValueError(f"{path}: the ids of {name} must start at 0 or 1, got {least}")
+    sums: dict[tuple[int, int], float] = {}
+    first: dict[tuple[int, int], int] = {}
+    for (state, action, _, probability, _), line in zip(rows.tolist(), lines, strict=True):
+        pair = (int(state), int(action))
+        sums[pair] = sums.get(pair, 0.0) + probability
+        first.setdefault(pair, line)
+    for (state, action), line in first.items():
+        if abs(sums[state, action] - 1.0) > 1e-6:
+            raise ValueError(
+                f"{path}, line {line}: the probabilities of action {action} in state {state} sum to "
+                f"{sums[state, action]:.9g}, not to 1"
+            )
+        if action > least and (state, action - 1) not in first:
+            raise ValueError(
+                f"{path}, line {line}: state {state} has an action {action} but no action {action - 1}"
+            )
 
 
 def _csv_row(cells: list[str], places: list[int], where: str) -> list[float]:
@@ -798,7 +818,7 @@ def _rows(transitions: npt.ArrayLike | Iterable[Sequence[float]]) -> Floats:
     names = "(state, action, next, probability, reward)"
     try:
         if not hasattr(transitions, "__array__"):
-            transitions = list(transitions)  # type: ignore[arg-type]
+            transitions = list(transitions)  # type: ignore[arg-type, assignment]
         rows = np.array(transitions, dtype=np.float64)
     except (TypeError, ValueError):
         raise ValueError(f"transitions must be rows of five numbers, {names}") from None

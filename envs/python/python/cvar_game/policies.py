@@ -50,6 +50,8 @@ def chooser(policy: Any, world: World) -> Callable[[Array], Array]:
 def as_actions(actions: Any, count: int | None, slots: int) -> Array:
     """Actions as the array that the worlds take, for so many slots."""
     array = np.asarray(actions)
+    if array.dtype == np.int64 and array.shape == (slots,) and count is not None:
+        return array
     shape = (slots,) if count is not None else (slots, 2)
     if count is not None and array.shape == (slots, 1):
         array = array[:, 0]
