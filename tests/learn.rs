@@ -52,7 +52,6 @@ fn player() -> PlayerOptions {
         gae_lambda: 0.95,
         entropy: 0.01,
         entropy_final: 0.01,
-        entropy_until: 1.0,
         value_coefficient: 0.5,
         gradient_norm: 0.5,
     }

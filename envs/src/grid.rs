@@ -177,6 +177,8 @@ pub struct LavaGrid {
     map: Map,
     /// What each move leads to, by cell.
     successors: Vec<[(usize, Step); MOVES]>,
+    /// The nominal law of the executed move, by the chosen one.
+    laws: [FiniteLaw<MOVES>; MOVES],
     /// The position in [-1, 1]^2, by cell.
     scaled: Vec<[f32; 2]>,
     /// Distance to the nearest lava per cell, in moves.
@@ -243,9 +245,7 @@ impl LavaGrid {
 
     /// The nominal law of the executed move, which depends only on the chosen move.
     pub fn law_of(&self, chosen: Move) -> FiniteLaw<MOVES> {
-        let mut probabilities = [self.config.slip / 3.0; MOVES];
-        probabilities[chosen.index()] = 1.0 - self.config.slip;
-        FiniteLaw { probabilities }
+        self.laws[chosen.index()]
     }
 
     fn coordinates_of(&self, cell: usize) -> [f64; 2] {
@@ -329,6 +329,11 @@ impl World for LavaGrid {
         let map = config.parse()?;
         let initial = Episode { cell: map.start(), time: 0, ended: false };
         let successors = |cell| Move::ALL.map(|executed| successor(config, &map, cell, executed));
+        let law = |chosen: Move| {
+            let mut probabilities = [config.slip / 3.0; MOVES];
+            probabilities[chosen.index()] = 1.0 - config.slip;
+            FiniteLaw { probabilities }
+        };
         let position = |cell| {
             let (x, y) = map.coordinates(cell);
             [scaled(x, map.width()), scaled(y, map.height())]
@@ -336,6 +341,7 @@ impl World for LavaGrid {
         Ok(LavaGrid {
             config: config.clone(),
             successors: (0..map.cells()).map(successors).collect(),
+            laws: Move::ALL.map(law),
             scaled: (0..map.cells()).map(position).collect(),
             clearance: clearance(&map),
             episodes: vec![initial; episodes],

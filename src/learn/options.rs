@@ -206,10 +206,8 @@ pub struct PlayerOptions {
     pub gae_lambda: f64,
     /// Weight of the entropy bonus at the player's first update.
     pub entropy: f64,
-    /// Weight of the entropy bonus from `entropy_until` on; linear before.
+    /// Weight of the entropy bonus at the player's last update; linear in between.
     pub entropy_final: f64,
-    /// Share of the player's updates after which the bonus is `entropy_final`.
-    pub entropy_until: f64,
     /// Weight of the value loss.
     pub value_coefficient: f64,
     /// Largest norm of the gradient; a longer one is scaled down to it.

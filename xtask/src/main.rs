@@ -1,4 +1,4 @@
-//! Chores of the workspace: `cargo xtask torch`, `speed`, `scaling`, `oracle`.
+//! Chores of the workspace: `cargo xtask torch`, `python`, `wheel`, `speed`, `scaling`, `oracle`.
 //!
 //! Nothing here is needed to build, test or use the program. `torch` provides libtorch, a C++ library of
 //! 480 MB that cargo cannot fetch, and runs a cargo command with the feature `torch`: it fetches the
@@ -8,6 +8,7 @@
 mod cache;
 mod libtorch;
 mod oracle;
+mod python;
 mod scaling;
 mod speed;
 mod tools;
@@ -39,6 +40,14 @@ enum Verb {
         #[arg(trailing_var_arg = true, allow_hyphen_values = true)]
         command: Vec<OsString>,
     },
+    /// Test the Python package, in an environment that is made for it in target/python
+    Python {
+        /// Passed on to pytest, such as a file or `-k NAME`
+        #[arg(trailing_var_arg = true, allow_hyphen_values = true)]
+        passed_on: Vec<OsString>,
+    },
+    /// Build the Python package for others: a wheel and its sources, in target/wheels
+    Wheel,
     /// Measure what training costs against its sizes; results go to results/speed
     Scaling,
     /// Compute the oracle of lava-point over noise and control steps, in about 40 minutes; the table goes to
@@ -72,6 +81,10 @@ fn run(verb: Verb) -> Result<ExitCode> {
             }
             cargo(&repository, &with_feature(command))
         }
+        Verb::Python { passed_on } => {
+            python::test(&repository, &speed::target(&repository), &passed_on)
+        }
+        Verb::Wheel => python::wheel(&repository, &speed::target(&repository)),
         Verb::Scaling => with_program(&repository, scaling::measure),
         Verb::Oracle => with_program(&repository, oracle::measure),
         Verb::Speed { passed_on } => {
@@ -147,22 +160,27 @@ fn cargo_command(repository: &Path) -> Command {
     let program = std::env::var_os("CARGO").unwrap_or_else(|| "cargo".into());
     let mut command = Command::new(program);
     command.current_dir(repository);
-    // `cargo run` gave this process variables of its own package. Left in place they would differ
-    // from those of a plain build and could make cargo build things twice.
+    forget_this_package(&mut command);
+    command
+}
+
+/// Takes the variables of this package from a command, which `cargo run` gave this process. Left in place they would
+/// differ from those of a plain build and could make cargo build things twice.
+fn forget_this_package(command: &mut Command) {
     for (name, _) in std::env::vars_os() {
         let text = name.to_string_lossy();
         if text.starts_with("CARGO_PKG_") || text.starts_with("CARGO_MANIFEST_") {
             command.env_remove(&name);
         }
     }
-    command
 }
 
 fn finish(mut command: Command) -> Result<ExitCode> {
-    let status = command.status().context("cargo could not be started")?;
+    let program = command.get_program().to_string_lossy().into_owned();
+    let status = command.status().with_context(|| format!("{program} could not be started"))?;
     match status.code() {
         Some(code) => Ok(ExitCode::from(u8::try_from(code).unwrap_or(1))),
-        None => bail!("cargo was stopped by a signal"),
+        None => bail!("{program} was stopped by a signal"),
     }
 }
 

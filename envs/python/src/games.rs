@@ -51,8 +51,8 @@ pub struct Stepped {
     pub clearance: Vec<f64>,
     /// Slots in which an episode began, if there is one. Their [`Stepped::more`] is 0.
     pub began: Option<Vec<bool>>,
-    /// What is told of the step.
-    pub more: More,
+    /// What is told of the step, if it is asked for.
+    pub more: Option<More>,
     /// With [`Autoreset::SameStep`], what the ended episodes ended with, if one has; 0 in other slots.
     pub last: Option<Last>,
 }
@@ -79,10 +79,13 @@ impl More {
             width: usize,
             keep: impl Fn(usize) -> bool,
         ) -> Vec<T> {
-            let number = |(i, &number): (usize, &T)| {
-                if keep(i / width) { number } else { T::default() }
-            };
-            numbers.iter().enumerate().map(number).collect()
+            let mut kept = numbers.to_vec();
+            for (slot, row) in kept.chunks_exact_mut(width).enumerate() {
+                if !keep(slot) {
+                    row.fill(T::default());
+                }
+            }
+            kept
         }
         let values = |of: &Values| match of {
             Values::Indices(indices) => Values::Indices(kept(indices, 1, keep)),
@@ -104,8 +107,8 @@ pub struct Last {
     pub observation: Vec<f32>,
     /// Distance to lava at the end.
     pub clearance: Vec<f64>,
-    /// What is told of the last step.
-    pub more: More,
+    /// What is told of the last step, if it is asked for.
+    pub more: Option<More>,
 }
 
 /// A batch of games.
@@ -144,7 +147,7 @@ pub trait AnyGames: Send {
     fn situation(&mut self, actions: &Values) -> Result<Vec<f32>, String>;
 
     /// One step of every slot. `parameters` are those of the perturbations, shape `[slots, parameters]`, where
-    /// Python plays the antagonist.
+    /// Python plays the antagonist; `tells` asks for [`Stepped::more`].
     ///
     /// # Errors
     /// If the actions or parameters are none, or an episode has ended and waits for a reset.
@@ -153,6 +156,7 @@ pub trait AnyGames: Send {
         actions: &Values,
         parameters: Option<&[f32]>,
         autoreset: Autoreset,
+        tells: bool,
     ) -> Result<Stepped, String>;
 
     /// All that the rest of a slot's episode depends on.
@@ -257,15 +261,6 @@ fn streams(seed: u64, episode: u64) -> Streams {
 pub fn dense(inputs: &Inputs, columns: Columns) -> Vec<f32> {
     let Columns { cells, numbers, critic_only } = columns;
     let seen = numbers - critic_only;
-    if cells == 0 && critic_only == 0 {
-        // All but the constant 1 at the end of each row.
-        return inputs
-            .numbers
-            .chunks_exact(numbers + 1)
-            .flat_map(|row| &row[..seen])
-            .copied()
-            .collect();
-    }
     let width = cells + seen;
     let mut rows = vec![0.0; inputs.numbers.len() / (numbers + 1) * width];
     let pairs = rows.chunks_exact_mut(width).zip(inputs.numbers.chunks_exact(numbers + 1));
@@ -373,6 +368,7 @@ impl<W: Playable> AnyGames for Games<W> {
         actions: &Values,
         parameters: Option<&[f32]>,
         autoreset: Autoreset,
+        tells: bool,
     ) -> Result<Stepped, String> {
         let actions = KindOf::<W>::read(actions, self.over.len())?;
         if let (Autoreset::Disabled, Some(slot)) =
@@ -395,13 +391,13 @@ impl<W: Playable> AnyGames for Games<W> {
         let steps = self.game.steps.iter();
         let reward = steps.clone().map(|step| step.reward).collect();
         let terminated: Vec<bool> = steps.clone().map(|step| step.end.is_some()).collect();
-        let mut more = More {
+        let mut more = tells.then(|| More {
             end: steps.map(|step| end(step.end)).collect(),
             outcome: W::Law::outcomes(&self.game.outcomes),
             nominal: W::Law::probabilities(&self.game.laws),
             ratio: self.game.ratios.clone(),
             budget: self.game.budgets.iter().map(|budget| budget.get()).collect(),
-        };
+        });
         self.over.copy_from_slice(&terminated);
         let mut last = None;
         let began = match autoreset {
@@ -412,11 +408,16 @@ impl<W: Playable> AnyGames for Games<W> {
         if let Some(began) = &began {
             if autoreset == Autoreset::SameStep {
                 let mut clearance = self.clearance();
-                clearance.iter_mut().zip(began).filter(|(_, ends)| !**ends).for_each(|(of, _)| *of = 0.0);
+                clearance
+                    .iter_mut()
+                    .zip(began)
+                    .filter(|(_, ends)| !**ends)
+                    .for_each(|(of, _)| *of = 0.0);
                 let observation = self.observe();
-                last = Some(Last { observation, clearance, more: more.only(|slot| began[slot]) });
+                let more = more.as_ref().map(|more| more.only(|slot| began[slot]));
+                last = Some(Last { observation, clearance, more });
             }
-            more = more.only(|slot| !began[slot]);
+            more = more.map(|more| more.only(|slot| !began[slot]));
             for slot in (0..began.len()).filter(|&slot| began[slot]) {
                 self.start_next(slot);
             }

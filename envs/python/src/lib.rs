@@ -399,12 +399,13 @@ struct Games {
     situation_size: usize,
     parameters: usize,
     autoreset: Autoreset,
+    tells: bool,
 }
 
 #[pymethods]
 impl Games {
     #[new]
-    #[pyo3(signature = (world, *, slots, features, time, eta, opponent, autoreset))]
+    #[pyo3(signature = (world, *, slots, features, time, eta, opponent, autoreset, tells=true))]
     #[expect(clippy::too_many_arguments, reason = "Python names them")]
     fn new(
         py: Python<'_>,
@@ -415,6 +416,7 @@ impl Games {
         eta: f64,
         opponent: &Opponent,
         autoreset: &str,
+        tells: bool,
     ) -> PyResult<Self> {
         let slots = count("num_envs", slots)? as usize;
         let setup = Setup { slots, view: view(features), time, eta: budget(eta)? };
@@ -436,6 +438,7 @@ impl Games {
             situation_size: games.situation_size(),
             parameters: games.parameters(),
             autoreset,
+            tells,
             games: Mutex::new(games),
         })
     }
@@ -495,7 +498,7 @@ impl Games {
         let parameters: Option<Vec<f32>> =
             parameters.map(|array| array.as_array().iter().copied().collect());
         let stepped = py.detach(|| {
-            lock(&self.games).step(&actions, parameters.as_deref(), self.autoreset)
+            lock(&self.games).step(&actions, parameters.as_deref(), self.autoreset, self.tells)
         });
         let Stepped { observation, reward, terminated, clearance, began, more, last } =
             valid(stepped)?;
@@ -505,19 +508,21 @@ impl Games {
             let observation = matrix(py, last.observation, self.observation_size)?;
             let ends = PyDict::new(py);
             tell(&ends, "clearance", last.clearance.into_pyarray(py), &ended)?;
-            last.more.tell(&ends, &ended)?;
+            if let Some(more) = last.more {
+                more.tell(&ends, &ended)?;
+            }
             tell(&infos, "final_obs", observation, &ended)?;
             tell(&infos, "final_info", ends, &ended)?;
         }
         let all = vec![true; self.slots].into_pyarray(py);
         tell(&infos, "clearance", clearance.into_pyarray(py), &all)?;
-        match began {
-            None => more.tell(&infos, &all)?,
-            Some(began) if !began.contains(&false) => {} // nobody made a step
-            Some(mut began) => {
+        match (more, began) {
+            (Some(more), None) => more.tell(&infos, &all)?,
+            (Some(more), Some(mut began)) if began.contains(&false) => {
                 began.iter_mut().for_each(|of| *of = !*of);
                 more.tell(&infos, &began.into_pyarray(py))?;
             }
+            _ => {} // nobody asked, or nobody made a step
         }
         Ok((
             matrix(py, observation, self.observation_size)?,

@@ -12,7 +12,6 @@
 use crate::law::Law;
 use crate::{budget, discount, invalid, valid};
 use cvar_game::exact::ExactError;
-use cvar_game::exact::antagonist;
 use cvar_game::exact::chow::Chow;
 use cvar_game::exact::law::{Perturbation, evaluate, evaluate_under};
 use cvar_game::exact::mdp::{FiniteMdp, MAX_NODES, Node, Outcome, State};
@@ -27,6 +26,7 @@ use numpy::{
     PyReadonlyArrayDyn, PyUntypedArrayMethods,
 };
 use pyo3::prelude::*;
+use std::cmp::Ordering;
 use std::sync::{Arc, OnceLock};
 
 /// The most numbers of a policy: one for each time, accumulated reward, state and action.
@@ -38,8 +38,11 @@ const MAX_MASSES: usize = 100_000_000;
 /// The largest reward, so that no sum of rewards overflows.
 const LARGEST_REWARD: f64 = 1e100;
 
-/// A tail of less probability counts as out of reach: its reciprocal would be no number soon.
-const LEAST_TAIL: f64 = 1e-200;
+/// A tail of less probability counts as out of reach: its reciprocal might not be finite.
+const LEAST_TAIL: f64 = f64::MIN_POSITIVE;
+
+/// The largest budget of a worst case, whose tail is in reach then.
+const LARGEST_BUDGET: f64 = 1e300;
 
 /// How far the sum of a law may be from 1. Decimals in files are rounded; such laws are normalised.
 const SUM_TOLERANCE: f64 = 1e-6;
@@ -81,12 +84,16 @@ struct Model {
     shift: usize,
     /// What they add to the return.
     offset: f64,
-    /// By Python's time: the accumulated rewards that can be reached, ascending, each with the solver's level.
+    /// By the solver's time and level: the first of the levels that differ by rounding only, as 0.1 + 0.2 and 0.3.
+    same: Vec<Vec<usize>>,
+    /// By Python's time: the accumulated rewards that can be reached, ascending, each with the first of its levels.
     levels: Vec<Vec<(f64, usize)>>,
     /// By the solver's time: the pairs (time, level) before it.
     blocks: Vec<usize>,
-    /// The largest accumulated reward of either sign.
+    /// The largest accumulated reward or return of the solver, of either sign.
     scale: f64,
+    /// How far two sums of the same rewards may be apart.
+    rounding: f64,
     chow: OnceLock<Chow>,
 }
 
@@ -172,11 +179,63 @@ impl Model {
                  reward, state and action; shorten the horizon or round the rewards"
             ));
         }
-        let levels = reached(&mdp, shift, offset);
-        let scale = levels.iter().flatten().map(|(value, _)| value.abs()).fold(0.0, f64::max);
+        let (reached, scale) = reached(&mdp);
         let actions = outcomes.iter().map(Vec::len).max().unwrap_or(0);
+        // Each step rounds a sum once, and each product.
+        let rounding = 2.0 * f64::EPSILON * (mdp.horizon() + 4) as f64 * scale;
+        let mut same: Vec<Vec<usize>> = Vec::with_capacity(mdp.horizon());
+        let mut levels = Vec::with_capacity(horizon);
+        for (time, reached) in reached.iter().enumerate() {
+            let accumulated = mdp.accumulated(time);
+            let mut firsts: Vec<usize> = Vec::with_capacity(accumulated.len());
+            let mut found: Vec<(f64, usize)> = Vec::new();
+            for level in 0..accumulated.len() {
+                let value = |level: usize| accumulated[level].discounted;
+                let new = level == 0 || value(level) - value(level - 1) > rounding;
+                let first = if new { level } else { firsts[level - 1] };
+                firsts.push(first);
+                if reached[level] && found.last().is_none_or(|last| last.1 != first) {
+                    found.push((value(first) - offset, first));
+                }
+            }
+            same.push(firsts);
+            if time >= shift {
+                levels.push(found);
+            }
+        }
         let chow = OnceLock::new();
-        Ok(Model { mdp, outcomes, actions, start, shift, offset, levels, blocks, scale, chow })
+        Ok(Model {
+            mdp,
+            outcomes,
+            actions,
+            start,
+            shift,
+            offset,
+            same,
+            levels,
+            blocks,
+            scale,
+            rounding,
+            chow,
+        })
+    }
+
+    /// How two of the solver's returns compare, apart from rounding.
+    fn compare(&self, one: f64, other: f64) -> Ordering {
+        if (one - other).abs() <= self.rounding { Ordering::Equal } else { one.total_cmp(&other) }
+    }
+
+    /// A deterministic policy that does the same at levels that differ by rounding only. It loses no more than that:
+    /// the shortfall to go is 1-Lipschitz in the accumulated reward.
+    fn merged(&self, policy: Policy) -> Policy {
+        let mut levels = self.same.iter().flat_map(|levels| levels.iter().enumerate());
+        if levels.all(|(level, first)| level == *first) {
+            return policy;
+        }
+        Policy::augmented_choice(&self.mdp, |node| {
+            let level = self.same[node.time][node.level];
+            policy.action(&self.mdp, Node { level, ..node })
+        })
     }
 
     fn states(&self) -> usize {
@@ -388,7 +447,8 @@ fn outcomes(transitions: &Transitions, states: usize) -> Result<Vec<Vec<Vec<Seen
 fn normalise<'a>(sum: f64, law: impl Iterator<Item = &'a mut f64>) -> Result<(), f64> {
     let off = (sum - 1.0).abs();
     // A NaN fails the comparison.
-    if !(off <= SUM_TOLERANCE) {
+    let possible = off <= SUM_TOLERANCE;
+    if !possible {
         return Err(sum);
     }
     if off > 1e-12 {
@@ -416,28 +476,35 @@ fn start_states(start: &[f64], outcomes: &[Vec<Vec<Seen>>]) -> Result<Vec<usize>
     }
 }
 
-/// By time after `shift`: the accumulated rewards that some policy reaches, less `offset`, and their levels.
-fn reached(mdp: &FiniteMdp, shift: usize, offset: f64) -> Vec<Vec<(f64, usize)>> {
+/// By time and level, whether some policy reaches it; and the largest accumulated reward or return, of either sign,
+/// that some policy reaches.
+fn reached(mdp: &FiniteMdp) -> (Vec<Vec<bool>>, f64) {
     let states = mdp.states();
     let mut levels = Vec::with_capacity(mdp.horizon());
+    let mut scale = 0.0_f64;
     let mut now = vec![false; states];
     now[mdp.start()] = true;
     for time in 0..mdp.horizon() {
         let accumulated = mdp.accumulated(time);
         let last = time + 1 == mdp.horizon();
         let mut next = vec![false; if last { 0 } else { mdp.accumulated(time + 1).len() * states }];
-        let mut found = Vec::new();
+        let mut found = Vec::with_capacity(accumulated.len());
         for (level, so_far) in accumulated.iter().enumerate() {
             let here = &now[level * states..][..states];
-            if here.contains(&true) {
-                found.push((so_far.discounted - offset, level));
+            found.push(here.contains(&true));
+            if found[level] {
+                scale = scale.max(so_far.discounted.abs());
             }
             for state in (0..states).filter(|state| here[*state]) {
+                let node = Node { time, level, state };
                 for action in 0..mdp.actions(state) {
                     for outcome in 0..mdp.outcome_count(state, action) {
-                        let after = mdp.successor(Node { time, level, state }, action, outcome);
-                        if let Some(Node { level, state, .. }) = after {
+                        if let Some(Node { level, state, .. }) =
+                            mdp.successor(node, action, outcome)
+                        {
                             next[level * states + state] = true;
+                        } else if let Some((_, value)) = mdp.ending(node, action, outcome) {
+                            scale = scale.max(value.abs());
                         }
                     }
                 }
@@ -446,7 +513,7 @@ fn reached(mdp: &FiniteMdp, shift: usize, offset: f64) -> Vec<Vec<(f64, usize)>>
         levels.push(found);
         now = next;
     }
-    levels.split_off(shift)
+    (levels, scale)
 }
 
 /// A finite MDP with a time limit.
@@ -569,10 +636,12 @@ impl Mdp {
     /// The best attainable CVaR and a policy that attains it.
     fn optimum(&self, py: Python<'_>, alpha: f64) -> PyResult<Optimum> {
         let model = &self.0;
-        let found = py.detach(|| optimum::optimum(&model.mdp, alpha));
-        let found = found.map_err(|error| invalid(error.to_string()))?;
-        let law = model.law(&found.evaluation.law);
-        Ok(Optimum { model: Arc::clone(model), policy: found.policy, law, alpha })
+        let found = py.detach(|| {
+            let policy = model.merged(optimum::optimum(&model.mdp, alpha)?.policy);
+            let law = model.law(&evaluate(&model.mdp, &policy).law);
+            Ok(Optimum { model: Arc::clone(model), policy, law, alpha })
+        });
+        found.map_err(|error: ExactError| invalid(error.to_string()))
     }
 
     /// The law of the return under a policy of shape `[S, A]` or `[T, S, A]`.
@@ -734,8 +803,8 @@ impl Optimum {
     }
 }
 
-/// The likelihood ratios of a worst case, as those of [`antagonist::WorstCase`]: of the probability of the tail
-/// after a step to that before it.
+/// The likelihood ratios of a worst case, as those of [`cvar_game::exact::antagonist`]: of the probability of the
+/// tail after a step to that before it. Returns that differ by rounding only are one return here.
 struct Tail {
     model: Arc<Model>,
     /// The solver's return at which the tail ends, and which share of that return belongs to it.
@@ -746,42 +815,61 @@ struct Tail {
 }
 
 impl Tail {
-    fn new(model: &Arc<Model>, worst: &antagonist::WorstCase<'_>) -> Self {
+    /// The tail of a deterministic policy whose law, in the solver's returns, is `law`.
+    fn new(model: &Arc<Model>, policy: &Policy, law: &ReturnLaw, alpha: f64) -> Self {
         let mdp = &model.mdp;
-        let mut probabilities = Vec::with_capacity(model.blocks[mdp.horizon()] * mdp.states());
-        for time in 0..mdp.horizon() {
+        let threshold = law.var(alpha);
+        let mass = |side: Ordering| -> f64 {
+            let atoms = law.atoms().iter();
+            atoms.filter(|of| model.compare(of.value, threshold) == side).map(|of| of.mass).sum()
+        };
+        // Only rounding takes the quotient out of [0, 1].
+        let share = ((alpha - mass(Ordering::Less)) / mass(Ordering::Equal)).clamp(0.0, 1.0);
+        let places = model.blocks[mdp.horizon()] * mdp.states();
+        let mut tail =
+            Tail { model: Arc::clone(model), threshold, share, probabilities: vec![0.0; places] };
+        for time in (0..mdp.horizon()).rev() {
             for level in 0..mdp.accumulated(time).len() {
-                for state in 0..mdp.states() {
-                    probabilities.push(worst.tail_probability(Node { time, level, state }));
+                for state in (0..mdp.states()).filter(|state| mdp.actions(*state) > 0) {
+                    let node = Node { time, level, state };
+                    let action = policy.action(mdp, node);
+                    let expectation = (0..mdp.outcome_count(state, action)).map(|outcome| {
+                        let probability = mdp.outcome(state, action, outcome).probability;
+                        probability * tail.after(node, action, outcome)
+                    });
+                    let expectation: f64 = expectation.sum();
+                    tail.probabilities[model.place(node)] = expectation;
                 }
             }
         }
-        let (threshold, share) = (worst.threshold(), worst.share());
-        Tail { model: Arc::clone(model), threshold, share, probabilities }
+        tail
     }
 
-    /// Its probability; 0 where it is too small to divide by.
+    /// The probability of the tail at a node; 0 where it is too small to divide by.
     fn at(&self, node: Node) -> f64 {
         let probability = self.probabilities[self.model.place(node)];
         if probability < LEAST_TAIL { 0.0 } else { probability }
+    }
+
+    /// That after an outcome.
+    fn after(&self, node: Node, action: usize, outcome: usize) -> f64 {
+        let mdp = &self.model.mdp;
+        let end = |(_, value)| match self.model.compare(value, self.threshold) {
+            Ordering::Less => 1.0,
+            Ordering::Equal => self.share,
+            Ordering::Greater => 0.0,
+        };
+        match mdp.successor(node, action, outcome) {
+            Some(next) => self.at(next),
+            None => mdp.ending(node, action, outcome).map_or(0.0, end),
+        }
     }
 }
 
 impl Perturbation for Tail {
     fn ratio(&self, node: Node, action: usize, outcome: usize) -> f64 {
-        let mdp = &self.model.mdp;
         let before = self.at(node);
-        if before == 0.0 {
-            return 1.0;
-        }
-        let after = match (mdp.successor(node, action, outcome), mdp.ending(node, action, outcome))
-        {
-            (Some(next), _) => self.at(next),
-            (None, Some((_, value))) if value < self.threshold => 1.0,
-            (None, Some((_, value))) if value == self.threshold => self.share,
-            _ => 0.0,
-        };
-        after / before
+        if before == 0.0 { 1.0 } else { self.after(node, action, outcome) / before }
     }
 }
 
@@ -799,11 +887,15 @@ pub struct MdpWorstCase {
 
 impl MdpWorstCase {
     fn new(model: &Arc<Model>, policy: Policy, eta: Eta) -> Result<Self, String> {
-        let worst = antagonist::WorstCase::new(&model.mdp, &policy, eta.get());
-        let worst = worst.map_err(|error| error.to_string())?;
-        let tail = Tail::new(model, &worst);
+        if eta.get() > LARGEST_BUDGET {
+            let eta = eta.get();
+            return Err(format!("eta = {eta:e} must be at most {LARGEST_BUDGET:e}"));
+        }
+        let nominal = evaluate(&model.mdp, &policy).law;
+        let tail = Tail::new(model, &policy, &nominal, eta.alpha());
         let law = model.law(&evaluate_under(&model.mdp, &policy, &tail).law);
-        Ok(MdpWorstCase { tail, policy, eta, value: worst.value() - model.offset, law })
+        let value = nominal.cvar(eta.alpha()) - model.offset;
+        Ok(MdpWorstCase { tail, policy, eta, value, law })
     }
 
     fn model(&self) -> &Model {

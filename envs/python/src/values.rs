@@ -146,7 +146,9 @@ impl<const N: usize> LawArray for FiniteLaw<N> {
     }
 
     fn probabilities(laws: &[Self]) -> Option<Values> {
-        Some(Values::Rows(laws.iter().flat_map(|law| law.probabilities).collect(), N))
+        let mut rows = Vec::with_capacity(laws.len() * N);
+        laws.iter().for_each(|law| rows.extend_from_slice(&law.probabilities));
+        Some(Values::Rows(rows, N))
     }
 }
 

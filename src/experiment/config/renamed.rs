@@ -12,7 +12,7 @@ const RENAMED: [(&str, &str); 3] = [
 ];
 
 /// What former versions did not write, by section and key, with the value that it had in them.
-fn added() -> [(&'static str, &'static str, Value); 9] {
+fn added() -> [(&'static str, &'static str, Value); 7] {
     [
         ("train.family", "train.family.kind", "auto".into()),
         ("train", "train.observation", "coordinates".into()),
@@ -21,8 +21,6 @@ fn added() -> [(&'static str, &'static str, Value); 9] {
         ("train", "train.critic_sees", "observation".into()),
         ("train", "train.exploring_starts", 0.0.into()),
         ("train", "train.exploring_until", 0.25.into()),
-        ("train.protagonist", "train.protagonist.entropy_until", 1.0.into()),
-        ("train.antagonist", "train.antagonist.entropy_until", 1.0.into()),
     ]
 }
 

@@ -332,13 +332,10 @@ pub fn schedule(options: &TrainOptions, eta: Eta) -> Vec<Turn> {
         };
         let progress = done[index] as f64 / (totals[index] as f64 - 1.0).max(1.0);
         done[index] += 1;
+        let between = |first: f64, last: f64| first * (1.0 - progress) + last * progress;
         let rates = Rates {
-            learning_rate: between(player.learning_rate, player.learning_rate_final, progress),
-            entropy: between(
-                player.entropy,
-                player.entropy_final,
-                (progress / player.entropy_until).min(1.0),
-            ),
+            learning_rate: between(player.learning_rate, player.learning_rate_final),
+            entropy: between(player.entropy, player.entropy_final),
         };
         let response = role == Role::Antagonist && is_response(options, update as u64, updates);
         let mode = if response { Mode::Greedy } else { Mode::Sampled };
@@ -346,11 +343,6 @@ pub fn schedule(options: &TrainOptions, eta: Eta) -> Vec<Turn> {
         Turn { update: update as u64 + 1, role, budget, mode, exploring, rates }
     };
     roles.iter().enumerate().map(turn).collect()
-}
-
-/// Linear from one value to another as `progress` goes from 0 to 1.
-fn between(first: f64, last: f64, progress: f64) -> f64 {
-    first * (1.0 - progress) + last * progress
 }
 
 /// Whose turn each of so many updates is, and at which budget.

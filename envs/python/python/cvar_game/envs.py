@@ -195,6 +195,7 @@ class LavaVectorEnv(gym.vector.VectorEnv[Array, Any, Array]):
         autoreset_mode: When an ended episode is followed by the next one: Gymnasium's ``NEXT_STEP``,
             ``SAME_STEP`` or ``DISABLED``.
         render_mode: As that of :class:`LavaEnv`; ``render()`` returns a frame per slot.
+        info: Whether a step tells more than the clearance, which takes a third of the time on lava-grid.
 
     Every array that it returns is a new one. The interpreter is released while the batch is stepped.
     """
@@ -215,6 +216,7 @@ class LavaVectorEnv(gym.vector.VectorEnv[Array, Any, Array]):
         eta: float | None = None,
         autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
         render_mode: str | None = None,
+        info: bool = True,
         **constants: Any,
     ) -> None:
         super().__init__()
@@ -241,6 +243,7 @@ class LavaVectorEnv(gym.vector.VectorEnv[Array, Any, Array]):
                 AutoresetMode.SAME_STEP: "same-step",
                 AutoresetMode.DISABLED: "disabled",
             }[self.autoreset_mode],
+            tells=info or self.render_mode is not None,
         )
         self._trails: list[list[Array]] = [[] for _ in range(self.num_envs)]
         self._seeded = False
