@@ -333,6 +333,15 @@ mod runs {
         ] {
             assert!(run.join(file).exists(), "{file} is missing");
         }
+        // The evaluation's time is told apart from that of training.
+        let manifest = fs::read_to_string(run.join("manifest.json")).unwrap();
+        let manifest: serde_json::Value = serde_json::from_str(&manifest).unwrap();
+        let seconds = ["seconds", "evaluation_seconds"].map(|key| manifest[key].as_f64().unwrap());
+        assert!(seconds.iter().all(|seconds| *seconds > 0.0), "{manifest}");
+        assert_eq!(json["seconds"], seconds[0]);
+        let table = answer(&["table", out.to_str().unwrap(), "--format", "csv"]);
+        assert!(table.lines().next().unwrap().contains("evaluation_seconds"), "{table}");
+
         let written = fs::metadata(run.join("final.safetensors")).unwrap().modified().unwrap();
         assert_eq!(answer(&arguments), first);
         let now = fs::metadata(run.join("final.safetensors")).unwrap().modified().unwrap();

@@ -93,6 +93,7 @@ fn result(folder: &Path) -> BTreeMap<String, Vec<u8>> {
             "evaluation.json" | "manifest.json" => {
                 let mut json: serde_json::Value = serde_json::from_slice(&bytes).unwrap();
                 json["seconds"] = 0.into();
+                json["evaluation_seconds"] = 0.into();
                 json.to_string().into_bytes()
             }
             // Its events have wall-clock times; that none is lost or doubled shows in its length.

@@ -50,7 +50,6 @@ class LavaVecEnv(VecEnv):
         infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
         for slot in np.flatnonzero(ended):
             infos[slot]["terminal_observation"] = batch_infos["final_obs"][slot]
-            infos[slot]["end"] = int(batch_infos["final_info"]["end"][slot])
         return observations, rewards.astype(np.float32), ended, infos
 
     def get_images(self) -> Sequence[Any]:

@@ -91,12 +91,12 @@ impl<'a> WorstCase<'a> {
 
     /// delta_t(o) at a node, given the action the policy chooses there.
     ///
-    /// Where h = 0 the tail is out of reach and delta = 1: under this antagonist such nodes have
+    /// Where h = 0 (below the least normal number) the tail is out of reach and delta = 1: under this antagonist such nodes have
     /// probability 0. `action` must be the one of the policy, else `E_P[delta]` = 1 does not hold.
     pub fn delta(&self, node: Node, action: usize, outcome: usize) -> f64 {
         let tail = self.tail_probability(node);
-        if tail == 0.0 {
-            return 1.0;
+        if tail < f64::MIN_POSITIVE {
+            return 1.0; // a quotient of subnormal numbers has no meaning
         }
         let after = match self.mdp.successor(node, action, outcome) {
             Some(next) => self.tail_probability(next),

@@ -170,7 +170,7 @@ fn improvement(group: &Group, baseline: Option<&Group>) -> Cell {
 /// Mean over the runs of what their training took; runs of other programs do not say.
 fn cost(group: &Group, of: impl Fn(&Run) -> Option<f64>) -> Cell {
     let told = group.runs.iter().filter(|run| run.steps > 0 && run.seconds > 0.0);
-    let values: Vec<f64> = told.filter_map(|run| of(run)).collect();
+    let values: Vec<f64> = told.filter_map(of).collect();
     estimate(statistics::mean(&values).map(|value| Estimate { value, interval: None }))
 }
 

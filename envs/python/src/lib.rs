@@ -3,6 +3,8 @@
 //! Python sees few functions with plain arguments: arrays, numbers and JSON. What is pleasant to use is written in
 //! Python, in `cvar_game/`. Bad input is a `ValueError` of one line; nothing here panics on it.
 
+#![expect(clippy::needless_pass_by_value, reason = "Python hands arguments over by value")]
+
 mod adversary;
 mod games;
 mod law;
@@ -35,6 +37,16 @@ use std::path::{Path, PathBuf};
 use std::sync::{Mutex, MutexGuard, PoisonError};
 use values::{Values, matrix};
 use worlds::{AnyPlayers, AnyWorld, Chance, Chooser, Table};
+
+/// An array of one dimension.
+type Column<'py, T> = Bound<'py, PyArray1<T>>;
+
+/// An array of two dimensions.
+type Matrix<'py, T> = Bound<'py, PyArray2<T>>;
+
+/// What a step of Gymnasium's vector environments returns: observation, reward, terminated, truncated, infos.
+type Returned<'py> =
+    (Matrix<'py, f32>, Column<'py, f64>, Column<'py, bool>, Column<'py, bool>, Bound<'py, PyDict>);
 
 /// Bad input.
 fn invalid(message: impl Into<String>) -> PyErr {
@@ -191,7 +203,7 @@ impl World {
         features: bool,
         time_aware: bool,
         time: u32,
-    ) -> PyResult<Bound<'py, PyArray2<f32>>> {
+    ) -> PyResult<Matrix<'py, f32>> {
         let seen = self.world.sights(&self.constants, view(features), time_aware, time);
         let (rows, width) = valid(seen)?;
         matrix(py, rows, width)
@@ -233,7 +245,7 @@ impl World {
         features: bool,
         time: bool,
         opponent: Option<&Opponent>,
-    ) -> PyResult<(Law, Bound<'py, PyArray1<f64>>, Bound<'py, PyArray1<f64>>)> {
+    ) -> PyResult<(Law, Column<'py, f64>, Column<'py, f64>)> {
         let (eta, gamma, episodes) = (budget(eta)?, discount(gamma)?, count("episodes", episodes)?);
         let slots = count("slots", slots)?.min(episodes) as usize;
         let setup = Setup { slots, view: view(features), time, eta };
@@ -464,7 +476,7 @@ impl Games {
         py: Python<'py>,
         slots: Vec<usize>,
         seeds: Option<Vec<u64>>,
-    ) -> PyResult<Bound<'py, PyArray2<f32>>> {
+    ) -> PyResult<Matrix<'py, f32>> {
         if let Some(slot) = slots.iter().find(|slot| **slot >= self.slots) {
             return Err(invalid(format!("there is no slot {slot}")));
         }
@@ -481,19 +493,12 @@ impl Games {
 
     /// One step, as Gymnasium's vector environments return it: observation, reward, terminated, truncated, infos.
     #[pyo3(signature = (actions, parameters=None))]
-    #[expect(clippy::type_complexity, reason = "it is what Gymnasium returns")]
     fn step<'py>(
         &self,
         py: Python<'py>,
         actions: &Bound<'py, PyAny>,
         parameters: Option<PyReadonlyArray2<'py, f32>>,
-    ) -> PyResult<(
-        Bound<'py, PyArray2<f32>>,
-        Bound<'py, PyArray1<f64>>,
-        Bound<'py, PyArray1<bool>>,
-        Bound<'py, PyArray1<bool>>,
-        Bound<'py, PyDict>,
-    )> {
+    ) -> PyResult<Returned<'py>> {
         let actions = Values::of_actions(actions, self.actions)?;
         let parameters: Option<Vec<f32>> =
             parameters.map(|array| array.as_array().iter().copied().collect());
@@ -538,29 +543,29 @@ impl Games {
         &self,
         py: Python<'py>,
         actions: &Bound<'py, PyAny>,
-    ) -> PyResult<Bound<'py, PyArray2<f32>>> {
+    ) -> PyResult<Matrix<'py, f32>> {
         let actions = Values::of_actions(actions, self.actions)?;
         let situation = valid(py.detach(|| lock(&self.games).situation(&actions)))?;
         matrix(py, situation, self.situation_size)
     }
 
     /// Distance to lava in each slot.
-    fn clearance<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray1<f64>> {
+    fn clearance<'py>(&self, py: Python<'py>) -> Column<'py, f64> {
         py.detach(|| lock(&self.games).clearance()).into_pyarray(py)
     }
 
     /// Position in each slot, shape `[slots, 2]`.
-    fn positions<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyArray2<f64>>> {
+    fn positions<'py>(&self, py: Python<'py>) -> PyResult<Matrix<'py, f64>> {
         matrix(py, py.detach(|| lock(&self.games).positions()), 2)
     }
 
     /// Steps since each slot's reset.
-    fn times<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray1<i64>> {
+    fn times<'py>(&self, py: Python<'py>) -> Column<'py, i64> {
         py.detach(|| lock(&self.games).times()).into_pyarray(py)
     }
 
     /// The index of each slot's state, in a finite world.
-    fn states<'py>(&self, py: Python<'py>) -> Option<Bound<'py, PyArray1<i64>>> {
+    fn states<'py>(&self, py: Python<'py>) -> Option<Column<'py, i64>> {
         py.detach(|| lock(&self.games).states()).map(|states| states.into_pyarray(py))
     }
 
@@ -586,18 +591,14 @@ fn tell<'py>(
     infos: &Bound<'py, PyDict>,
     key: &str,
     values: impl IntoPyObject<'py>,
-    mask: &Bound<'py, PyArray1<bool>>,
+    mask: &Column<'py, bool>,
 ) -> PyResult<()> {
     infos.set_item(key, values)?;
     infos.set_item(format!("_{key}"), mask)
 }
 
 impl More {
-    fn tell<'py>(
-        self,
-        infos: &Bound<'py, PyDict>,
-        mask: &Bound<'py, PyArray1<bool>>,
-    ) -> PyResult<()> {
+    fn tell<'py>(self, infos: &Bound<'py, PyDict>, mask: &Column<'py, bool>) -> PyResult<()> {
         let py = infos.py();
         tell(infos, "outcome", self.outcome, mask)?;
         if let Some(nominal) = self.nominal {
@@ -747,7 +748,7 @@ mod _core {
     #[pymodule_export]
     use super::law::Law;
     #[pymodule_export]
-    use super::mdp::{Mdp, Optimum};
+    use super::mdp::{Mdp, MdpWorstCase, Optimum};
     #[pymodule_export]
     use super::{Games, Judged, Opponent, Run, World, program, read_results, worlds_of, write_run};
 }

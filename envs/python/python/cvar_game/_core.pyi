@@ -6,7 +6,7 @@ Arrays must have the given type exactly; ``SupportsFloat`` and the like are not 
 from collections.abc import Callable, Sequence
 from os import PathLike
 from pathlib import Path
-from typing import Any, Literal, final, type_check_only
+from typing import Any, final, type_check_only
 
 import numpy as np
 import numpy.typing as npt
@@ -89,7 +89,8 @@ class Games:
         time: bool,
         eta: float,
         opponent: Opponent,
-        autoreset: Literal["next-step", "same-step", "disabled"],
+        autoreset: str,
+        tells: bool = True,
     ) -> Games: ...
     @property
     def observation_size(self) -> int: ...

@@ -12,7 +12,7 @@ Chance is reproducible: the k-th episode after ``reset(seed=s)`` meets the same 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, ClassVar, SupportsFloat
+from typing import Any, SupportsFloat
 
 import gymnasium as gym
 import numpy as np
@@ -98,7 +98,7 @@ class LavaEnv(gym.Env[Array, Any]):
     ``budget``: what is left of eta, and ``end``: 0 not yet, 1 goal, 2 lava, 3 time limit.
     """
 
-    metadata: ClassVar[dict[str, Any]] = {
+    metadata: dict[str, Any] = {
         "render_modes": list(RENDER_MODES),
         "render_fps": FRAMES_PER_SECOND,
     }
@@ -200,7 +200,7 @@ class LavaVectorEnv(gym.vector.VectorEnv[Array, Any, Array]):
     Every array that it returns is a new one. The interpreter is released while the batch is stepped.
     """
 
-    metadata: ClassVar[dict[str, Any]] = {
+    metadata: dict[str, Any] = {
         "render_modes": list(RENDER_MODES),
         "render_fps": FRAMES_PER_SECOND,
     }

@@ -39,7 +39,7 @@ PROTAGONIST, ANTAGONIST = "protagonist", "antagonist"
 MODES = ("human", *RENDER_MODES)
 
 
-class LavaGame(AECEnv[str, Array, Any]):
+class LavaGame(AECEnv[str, Array, Any]):  # type: ignore[misc]
     """The game of a world.
 
     Args:
@@ -88,7 +88,7 @@ class LavaGame(AECEnv[str, Array, Any]):
             opponent=_core.Opponent.played(family, components, 4.0, 50.0),
             autoreset="disabled",
         )
-        unbounded = {"low": -np.inf, "high": np.inf, "dtype": np.float32}
+        unbounded: dict[str, Any] = {"low": -np.inf, "high": np.inf, "dtype": np.float32}
         self.observation_spaces = {
             PROTAGONIST: observation_space(self.world, observation, time),
             ANTAGONIST: gym.spaces.Box(shape=(self._games.situation_size,), **unbounded),
@@ -100,7 +100,7 @@ class LavaGame(AECEnv[str, Array, Any]):
         self._seeds = np.random.default_rng()
         self._seeded = False
         self._trail: list[Array] = []
-        self.agents = []
+        self.agents: list[str] = []
 
     def observation_space(self, agent: str) -> gym.spaces.Space[Any]:
         """What an agent sees."""
@@ -121,9 +121,9 @@ class LavaGame(AECEnv[str, Array, Any]):
         self._cumulative_rewards = dict.fromkeys(self.agents, 0.0)
         self.terminations = dict.fromkeys(self.agents, False)
         self.truncations = dict.fromkeys(self.agents, False)
-        self.infos = {agent: {} for agent in self.agents}
+        self.infos: dict[str, dict[str, Any]] = {agent: {} for agent in self.agents}
         blind = np.zeros(self._games.situation_size, np.float32)
-        self._sights = {PROTAGONIST: sight[0], ANTAGONIST: blind}
+        self._sights: dict[str, Array] = {PROTAGONIST: sight[0], ANTAGONIST: blind}
         self._chosen: Array | None = None
         self.agent_selection = PROTAGONIST
         self._trail = [self._games.positions()[0]]
@@ -145,6 +145,7 @@ class LavaGame(AECEnv[str, Array, Any]):
             self.rewards = dict.fromkeys(self.agents, 0.0)
             self.agent_selection = ANTAGONIST
             return
+        assert self._chosen is not None  # it is the antagonist's turn
         parameters = np.asarray(action)
         if parameters.shape != (self._games.parameters,):
             raise ValueError(

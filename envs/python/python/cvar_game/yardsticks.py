@@ -204,7 +204,7 @@ def evaluate(
         world = World.of(world, constants)
     eta = float(eta)
     is_table = not callable(policy) and not hasattr(policy, "predict")
-    setting = {
+    setting: dict[str, Any] = {
         "eta": eta,
         "gamma": gamma,
         "episodes": episodes,
@@ -236,14 +236,14 @@ def evaluate(
 def _of_table(table: Array, world: World) -> Any:
     """The greedy version of a table, as a function of features with the time."""
 
-    def choose(observations: Array) -> Array:
+    def choose(observations: Array) -> npt.NDArray[np.int64]:
         states = world.states or 0
         cells = observations[:, :states].argmax(axis=1)
         if table.ndim == 2:
-            return table[cells].argmax(axis=1).astype(np.int64)
+            return np.asarray(table[cells].argmax(axis=1), dtype=np.int64)
         share = (observations[:, states] + 1.0) / 2.0
         times = np.rint(share * world.horizon).astype(np.int64).clip(0, world.horizon - 1)
-        return table[times, cells].argmax(axis=1).astype(np.int64)
+        return np.asarray(table[times, cells].argmax(axis=1), dtype=np.int64)
 
     return choose
 
