@@ -339,7 +339,8 @@ mod runs {
         let seconds = ["seconds", "evaluation_seconds"].map(|key| manifest[key].as_f64().unwrap());
         assert!(seconds.iter().all(|seconds| *seconds > 0.0), "{manifest}");
         assert_eq!(json["seconds"], seconds[0]);
-        let table = answer(&["table", out.to_str().unwrap(), "--format", "csv"]);
+        answer(&["table", out.to_str().unwrap()]);
+        let table = fs::read_to_string(out.join("table.csv")).unwrap();
         assert!(table.lines().next().unwrap().contains("evaluation_seconds"), "{table}");
 
         let written = fs::metadata(run.join("final.safetensors")).unwrap().modified().unwrap();

@@ -82,6 +82,7 @@ fn manifest(dir: &Path, env: &str, eta: f64, seed: u64, failure: Option<&str>) {
         seconds: 3.0,
         steps: 250_000,
         notes: Vec::new(),
+        evaluation_seconds: None,
         failure: failure.map(str::to_owned),
     };
     let folder = folder(dir, env, eta, seed);

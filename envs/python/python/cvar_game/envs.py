@@ -11,7 +11,7 @@ Chance is reproducible: the k-th episode after ``reset(seed=s)`` meets the same 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, SupportsFloat
 
 import gymnasium as gym
@@ -21,9 +21,10 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
 from cvar_game import _core
+from cvar_game._arguments import MOST_EPISODES, MOST_NUMBERS, array_of, eta_of, seed_of, shown, whole
 from cvar_game.policies import as_actions, features_of
 from cvar_game.rendering import ansi
-from cvar_game.worlds import Opponent, World, core_opponent
+from cvar_game.worlds import Opponent, World, core_opponent, is_nominal
 
 Array = npt.NDArray[Any]
 
@@ -53,9 +54,9 @@ def action_space(world: World) -> gym.spaces.Space[Any]:
 
 def check_render_mode(mode: str | None, modes: Sequence[str] = RENDER_MODES) -> str | None:
     """Refuses a render mode that there is not."""
-    if mode is not None and mode not in modes:
+    if mode is not None and not (isinstance(mode, str) and mode in modes):
         names = " or ".join(repr(of) for of in modes)
-        raise ValueError(f"render_mode = {mode!r}: use None, {names}")
+        raise ValueError(f"render_mode = {shown(mode)}: use None, {names}")
     return mode
 
 
@@ -64,8 +65,8 @@ def resolve_eta(eta: float | None, opponent: Opponent) -> float:
     from cvar_game.results import Run, load
 
     if eta is not None:
-        return float(eta)
-    if opponent is None or opponent == "nominal":
+        return eta_of(eta)
+    if opponent is None or is_nominal(opponent):
         return 1.0
     if isinstance(opponent, Run):
         return opponent.eta
@@ -134,6 +135,7 @@ class LavaEnv(gym.Env[Array, Any]):
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Array, dict[str, Any]]:
         """Starts the first episode of a seed, or the next one."""
+        seed = None if seed is None else seed_of(seed)
         super().reset(seed=seed)
         if seed is None and not self._seeded:
             seed = int(self.np_random.integers(2**63))
@@ -147,7 +149,7 @@ class LavaEnv(gym.Env[Array, Any]):
         """One step; see the class for ``info``."""
         if not self._open:
             raise ValueError("reset() the environment first; a closed one cannot be stepped")
-        actions = as_actions(np.asarray(action)[None], self.world.actions, 1)
+        actions = as_actions(array_of("actions", action)[None], self.world.actions, 1)
         observation, reward, terminated, _, infos = self._games.step(actions)
         self._follow()
         info = {key: values[0] for key, values in infos.items() if key[0] != "_"}
@@ -220,14 +222,16 @@ class LavaVectorEnv(gym.vector.VectorEnv[Array, Any, Array]):
         **constants: Any,
     ) -> None:
         super().__init__()
-        if not isinstance(num_envs, (int, np.integer)) or num_envs < 1:
-            raise ValueError(f"num_envs = {num_envs!r} must be a positive integer")
+        num_envs = whole("num_envs", num_envs, 1, MOST_EPISODES)
         self.render_mode = check_render_mode(render_mode)
         self.autoreset_mode = _autoreset_mode(autoreset_mode)
         self.metadata = {**type(self).metadata, "autoreset_mode": self.autoreset_mode}
         self.world = World.of(world, constants)
-        self.num_envs = int(num_envs)
+        self.num_envs = num_envs
         self.single_observation_space = observation_space(self.world, observation, time)
+        width = self.single_observation_space.shape[0]
+        if num_envs * width > MOST_NUMBERS:
+            raise ValueError(f"num_envs = {num_envs} observations of {width} numbers are too many to be held")
         self.single_action_space = action_space(self.world)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
@@ -261,6 +265,8 @@ class LavaVectorEnv(gym.vector.VectorEnv[Array, Any, Array]):
         """
         seeds = self._seeds(seed)
         mask = np.ones(self.num_envs, np.bool_)
+        if options is not None and not isinstance(options, Mapping):
+            raise ValueError(f"options = {shown(options)} must be a dictionary")
         if options is not None and "reset_mask" in options:
             mask = _reset_mask(options["reset_mask"], self.num_envs)
         if not self._seeded:
@@ -303,10 +309,11 @@ class LavaVectorEnv(gym.vector.VectorEnv[Array, Any, Array]):
 
     def snapshot(self, slot: int) -> bytes:
         """All that the rest of a slot's episode depends on."""
-        return bytes(self._games.snapshot(slot))
+        return bytes(self._games.snapshot(whole("slot", slot, 0, self.num_envs - 1)))
 
     def restore(self, slot: int, snapshot: bytes) -> None:
         """Continues where a snapshot was taken, in an environment with the same arguments."""
+        slot = whole("slot", slot, 0, self.num_envs - 1)
         self._games.restore(slot, snapshot)
         self._seeded = True
         mask = np.zeros(self.num_envs, np.bool_)
@@ -317,11 +324,12 @@ class LavaVectorEnv(gym.vector.VectorEnv[Array, Any, Array]):
         if seed is None:
             return [None] * self.num_envs
         if isinstance(seed, (int, np.integer)):
+            seeds = [seed_of(int(seed) + slot) for slot in range(self.num_envs)]
             self._np_random, self._np_random_seed = gym.utils.seeding.np_random(int(seed))
-            return [_seed(seed + slot) for slot in range(self.num_envs)]
+            return [*seeds]
         if len(seed) != self.num_envs:
             raise ValueError(f"there must be {self.num_envs} seeds, got {len(seed)}")
-        return [None if of is None else _seed(of) for of in seed]
+        return [None if of is None else seed_of(of) for of in seed]
 
     def _follow(self, restarted: Array, moved: bool) -> None:
         if self.render_mode is None:
@@ -341,18 +349,12 @@ def _each(rows: Array, ended: Array) -> Array:
     return each
 
 
-def _seed(seed: int) -> int:
-    if not 0 <= seed < 2**64:
-        raise ValueError(f"seed = {seed} must be in [0, 2^64)")
-    return int(seed)
-
-
 def _autoreset_mode(mode: str | AutoresetMode) -> AutoresetMode:
     try:
         return mode if isinstance(mode, AutoresetMode) else AutoresetMode(mode)
     except ValueError:
         names = ", ".join(repr(of.value) for of in AutoresetMode)
-        raise ValueError(f"autoreset_mode = {mode!r}: use one of {names}") from None
+        raise ValueError(f"autoreset_mode = {shown(mode)}: use one of {names}") from None
 
 
 def _reset_mask(mask: Any, slots: int) -> Array:

@@ -21,6 +21,7 @@ import numpy.typing as npt
 from pettingzoo import AECEnv
 
 from cvar_game import _core
+from cvar_game._arguments import array_of, eta_of, numbers, seed_of, shown, whole
 from cvar_game.envs import (
     FRAMES_PER_SECOND,
     RENDER_MODES,
@@ -84,8 +85,8 @@ class LavaGame(AECEnv[str, Array, Any]):  # type: ignore[misc]
             slots=1,
             features=features_of(observation),
             time=time,
-            eta=float(eta),
-            opponent=_core.Opponent.played(family, components, 4.0, 50.0),
+            eta=eta_of(eta),
+            opponent=_core.Opponent.played(family, whole("components", components, 1, 3), 4.0, 50.0),
             autoreset="disabled",
         )
         unbounded: dict[str, Any] = {"low": -np.inf, "high": np.inf, "dtype": np.float32}
@@ -101,17 +102,19 @@ class LavaGame(AECEnv[str, Array, Any]):  # type: ignore[misc]
         self._seeded = False
         self._trail: list[Array] = []
         self.agents: list[str] = []
+        self.agent_selection = PROTAGONIST
 
     def observation_space(self, agent: str) -> gym.spaces.Space[Any]:
         """What an agent sees."""
-        return self.observation_spaces[agent]
+        return self.observation_spaces[_agent(agent)]
 
     def action_space(self, agent: str) -> gym.spaces.Space[Any]:
         """What an agent chooses from."""
-        return self.action_spaces[agent]
+        return self.action_spaces[_agent(agent)]
 
     def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> None:
         """Starts the first episode of a seed, or the next one."""
+        seed = None if seed is None else seed_of(seed)
         if seed is None and not self._seeded:
             seed = int(self._seeds.integers(2**63))
         self._seeded = True
@@ -130,30 +133,33 @@ class LavaGame(AECEnv[str, Array, Any]):  # type: ignore[misc]
 
     def observe(self, agent: str) -> Array:
         """What an agent sees; for the antagonist, zeros before the protagonist's first action."""
-        return self._sights[agent].copy()
+        if not self._seeded:
+            raise ValueError("reset() the game first")
+        return self._sights[_agent(agent)].copy()
 
     def step(self, action: Any) -> None:
         """The turn of ``agent_selection``."""
+        if not self.agents:
+            raise ValueError("reset() the game first: no episode is running")
         agent = self.agent_selection
         if self.terminations[agent]:
             self._was_dead_step(action)
             return
         self._cumulative_rewards[agent] = 0.0
         if agent == PROTAGONIST:
-            self._chosen = as_actions(np.asarray(action)[None], self.world.actions, 1)
+            self._chosen = as_actions(array_of("actions", action)[None], self.world.actions, 1)
             self._sights[ANTAGONIST] = self._games.situation(self._chosen)[0]
             self.rewards = dict.fromkeys(self.agents, 0.0)
             self.agent_selection = ANTAGONIST
             return
         assert self._chosen is not None  # it is the antagonist's turn
-        parameters = np.asarray(action)
+        parameters = numbers("the antagonist's action", action).astype(np.float32)
         if parameters.shape != (self._games.parameters,):
             raise ValueError(
                 f"the antagonist's action must have shape ({self._games.parameters},), got "
                 f"{parameters.shape}"
             )
-        parameters = np.ascontiguousarray(parameters[None], dtype=np.float32)
-        sight, reward, terminated, _, infos = self._games.step(self._chosen, parameters)
+        sight, reward, terminated, _, infos = self._games.step(self._chosen, parameters[None])
         self._sights[PROTAGONIST] = sight[0]
         self.rewards = {PROTAGONIST: float(reward[0]), ANTAGONIST: -float(reward[0])}
         self.terminations = dict.fromkeys(self.agents, bool(terminated[0]))
@@ -175,6 +181,12 @@ class LavaGame(AECEnv[str, Array, Any]):  # type: ignore[misc]
 
     def close(self) -> None:
         """Nothing is left open."""
+
+
+def _agent(agent: str) -> str:
+    if isinstance(agent, str) and agent in (PROTAGONIST, ANTAGONIST):
+        return agent
+    raise ValueError(f"there is no agent {shown(agent)}; there are {PROTAGONIST} and {ANTAGONIST}")
 
 
 def env(**options: Any) -> LavaGame:

@@ -40,6 +40,7 @@ from typing import TYPE_CHECKING, Any, Union
 import numpy as np
 import numpy.typing as npt
 
+from cvar_game._arguments import array_of, number, numbers, shown, whole
 from cvar_game._core import Law, Mdp, Optimum
 
 if TYPE_CHECKING:
@@ -142,19 +143,19 @@ class FiniteMDP:
         try:
             first = operator.index(start)  # type: ignore[arg-type]
         except TypeError:
-            law, first = _numbers("start", start), 0
+            law, first = numbers("start", start), 0
             if law.ndim != 1:
                 raise ValueError(
-                    f"start = {start!r} must be a state or the probabilities of all states, shape (S,)"
+                    f"start = {shown(start)} must be a state or the probabilities of all states, shape (S,)"
                 ) from None
             mentioned = max(mentioned, len(law) - 1)
         if states is None:
-            count = _whole("the number of states", max(mentioned, first) + 1, 1)
+            count = whole("the number of states", max(mentioned, first) + 1, 1, LARGEST)
         else:
-            count = _whole("states", states, 1)
+            count = whole("states", states, 1, LARGEST)
         if law is None:
             if not 0 <= first < count:
-                raise ValueError(f"start = {first} must be a state in [0, {count})")
+                raise ValueError(f"start = {shown(first)} must be a state in [0, {count})")
             law = np.zeros(count)
             law[first] = 1.0
         elif len(law) < count and states is None:
@@ -169,8 +170,8 @@ class FiniteMDP:
             np.ascontiguousarray(rows[:, 4]),
             states=count,
             start=law,
-            horizon=_whole("horizon", horizon, 1),
-            gamma=_number("gamma", gamma),
+            horizon=whole("horizon", horizon, 1, LARGEST),
+            gamma=number("gamma", gamma),
         )
 
     def __repr__(self) -> str:
@@ -245,8 +246,10 @@ class FiniteMDP:
             ValueError: If a line makes no sense; the message has its number.
             OSError: If the file cannot be read.
         """
-        rows, lines = _read_csv(path)
-        _check_csv(path, rows, lines)
+        name = os.fsdecode(path)
+        name = name if name.isprintable() else shown(name)
+        rows, lines = _read_csv(path, name)
+        _check_csv(name, rows, lines)
         rows[:, [0, 2]] -= rows[:, [0, 2]].min()
         rows[:, 1] -= rows[:, 1].min()
         return cls(rows, horizon=horizon, gamma=gamma, start=start)
@@ -309,7 +312,7 @@ class FiniteMDP:
         Args:
             alpha: Risk level in (0, 1]; 1 is the mean.
         """
-        return self._core.optimum(_number("alpha", alpha))
+        return self._core.optimum(number("alpha", alpha))
 
     def evaluate(self, policy: Policy) -> Law:
         """The exact law of the return under a policy: its values and probabilities, mean, VaR and CVaR.
@@ -338,7 +341,7 @@ class FiniteMDP:
                 that draws its actions such an antagonist would not be the worst.
             eta: Budget, at least 1.
         """
-        eta = _number("eta", eta)
+        eta = number("eta", eta)
         if isinstance(policy, Optimum):
             return self._own(policy).worst_case(eta)
         return self._core.worst_case(self._probabilities(policy), eta)
@@ -354,7 +357,7 @@ class FiniteMDP:
         Args:
             eta: Budget, at least 1.
         """
-        return self._core.chow(_number("eta", eta))
+        return self._core.chow(number("eta", eta))
 
     def best_stationary(self, alpha: float) -> Stationary:
         """A good deterministic policy that sees the state only, found by local search: not proven the best.
@@ -364,7 +367,7 @@ class FiniteMDP:
         Args:
             alpha: Risk level in (0, 1].
         """
-        alpha = _number("alpha", alpha)
+        alpha = number("alpha", alpha)
         law, actions, local_optimum, evaluated = self._core.best_stationary(alpha)
         return Stationary(
             alpha=alpha,
@@ -386,12 +389,9 @@ class FiniteMDP:
         """A policy as action probabilities of shape ``(S, A)`` or ``(T, S, A)``."""
         if isinstance(policy, Stationary):
             policy = policy.actions
-        try:
-            array = np.asarray(policy)
-        except ValueError:
-            raise ValueError("a policy must be an array, but its rows differ in length") from None
+        array = array_of("the policy", policy)
         if array.dtype.kind not in "iu":
-            return np.ascontiguousarray(_numbers("the policy", array))
+            return numbers("the policy", array)
         shapes = ((self.states,), (self.horizon, self.states))
         if array.shape not in shapes:
             raise ValueError(
@@ -465,11 +465,12 @@ def admissible(ratios: npt.ArrayLike, probabilities: npt.ArrayLike, budget: floa
     Raises:
         ValueError: If a ratio is negative or not finite, or all are 0 where the law has mass.
     """
-    law, ratio = _numbers("probabilities", probabilities), _numbers("ratios", ratios)
+    law, ratio = numbers("probabilities", probabilities), numbers("ratios", ratios)
+    budget = number("budget", budget)
     if law.ndim != 1 or ratio.shape != law.shape:
         raise ValueError(f"ratios must have shape {law.shape}, got {ratio.shape}")
     if not (np.isfinite(ratio).all() and (ratio >= 0.0).all()):
-        raise ValueError(f"likelihood ratios must be finite and not negative, got {ratio}")
+        raise ValueError(f"likelihood ratios must be finite and not negative, got {shown(ratio)}")
     if not 1.0 <= budget < np.inf:
         raise ValueError(f"a budget must be a finite number of at least 1, got {budget}")
     if budget == 1.0:
@@ -491,6 +492,8 @@ class _Fixed:
     """The exact worst case of a policy between an environment and an agent."""
 
     def __init__(self, inner: Any, mdp: FiniteMDP, eta: float, policy: Policy) -> None:
+        if not isinstance(mdp, FiniteMDP):
+            raise ValueError(f"mdp = {shown(mdp)} must be a FiniteMDP, or None for that of the environment")
         self.mdp = mdp
         self.worst = mdp.worst_case(policy, eta)
         # By state and action: the outcome of the MDP that each transition is, -1 if it is impossible.
@@ -597,10 +600,10 @@ def _budgeted_antagonist() -> type[Any]:
             gymnasium.Wrapper.__init__(self, env)
             if (policy is None) == (ratios is None):
                 raise ValueError("an antagonist needs either a policy or ratios")
-            self.eta = _number("eta", eta)
+            self.eta = number("eta", eta)
             """Budget."""
             if not 1.0 <= self.eta < np.inf:
-                raise ValueError(f"the budget eta must be a finite number of at least 1, got {eta}")
+                raise ValueError(f"the budget eta must be a finite number of at least 1, got {self.eta}")
             inner: Any = env.unwrapped
             _table_rows(inner)
             if ratios is not None and not callable(ratios):
@@ -740,7 +743,7 @@ def _table_rows(inner: Any) -> tuple[list[tuple[float, float, float, float, floa
                     next_state = -1 if terminated else int(next_state)
                     row = (state, action, next_state, float(probability), float(reward))
                     rows.append(row)
-        except (IndexError, KeyError, TypeError, ValueError):
+        except (IndexError, KeyError, OverflowError, TypeError, ValueError):
             raise ValueError(
                 f"env.unwrapped.P[{state}] must be {{action: [(probability, next, reward, terminated)]}}, "
                 "with states and actions numbered from 0"
@@ -748,31 +751,31 @@ def _table_rows(inner: Any) -> tuple[list[tuple[float, float, float, float, floa
     return rows, len(table)
 
 
-def _read_csv(path: str | os.PathLike[str]) -> tuple[Floats, list[int]]:
+def _read_csv(path: str | os.PathLike[str], name: str) -> tuple[Floats, list[int]]:
     """Rows of a CSV file in the order of :data:`COLUMNS`, and their line numbers."""
     rows: list[list[float]] = []
     lines: list[int] = []
     with open(path, newline="", encoding="utf-8-sig") as file:
         reader = csv.reader(file, strict=True)
         try:
-            header = [name.strip().lower() for name in next(reader, [])]
-            missing = [name for name in COLUMNS if name not in header]
+            header = [cell.strip().lower() for cell in next(reader, [])]
+            missing = [column for column in COLUMNS if column not in header]
             if missing:
-                raise ValueError(f"{path}, line 1: the header must have {','.join(COLUMNS)}")
-            places = [header.index(name) for name in COLUMNS]
+                raise ValueError(f"{name}, line 1: the header must have {','.join(COLUMNS)}")
+            places = [header.index(column) for column in COLUMNS]
             for cells in reader:
                 if not any(cell.strip() for cell in cells):
                     continue
-                rows.append(_csv_row(cells, places, f"{path}, line {reader.line_num}"))
+                rows.append(_csv_row(cells, places, f"{name}, line {reader.line_num}"))
                 lines.append(reader.line_num)
         except (csv.Error, UnicodeDecodeError) as error:
-            raise ValueError(f"{path}, line {reader.line_num + 1}: {error}") from None
+            raise ValueError(f"{name}, line {reader.line_num + 1}: {error}") from None
     if not rows:
-        raise ValueError(f"{path} has no transitions")
+        raise ValueError(f"{name} has no transitions")
     return np.array(rows, dtype=np.float64), lines
 
 
-def _check_csv(path: str | os.PathLike[str], rows: Floats, lines: list[int]) -> None:
+def _check_csv(path: str, rows: Floats, lines: list[int]) -> None:
     """Refuses what only several lines together say, in the file's own ids."""
     for columns, name in (([0, 2], "states"), ([1], "actions")):
         least = int(rows[:, columns].min())
@@ -824,7 +827,7 @@ def _rows(transitions: npt.ArrayLike | Iterable[Sequence[float]]) -> Floats:
         if not hasattr(transitions, "__array__"):
             transitions = list(transitions)  # type: ignore[arg-type, assignment]
         rows = np.array(transitions, dtype=np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError, MemoryError):
         raise ValueError(f"transitions must be rows of five numbers, {names}") from None
     if len(rows) == 0:
         raise ValueError(f"there are no transitions {names}")
@@ -844,30 +847,3 @@ def _rows(transitions: npt.ArrayLike | Iterable[Sequence[float]]) -> Floats:
 
 def _restore(rows: Floats, horizon: int, gamma: float, start: Floats, states: int) -> FiniteMDP:
     return FiniteMDP(rows, horizon=horizon, gamma=gamma, start=start, states=states)
-
-
-def _numbers(name: str, values: npt.ArrayLike) -> Floats:
-    try:
-        array = np.asarray(values)
-        if array.dtype.kind in "biufO":
-            return array.astype(np.float64)
-    except (TypeError, ValueError):
-        pass
-    raise ValueError(f"{name} must be an array of real numbers")
-
-
-def _number(name: str, value: float) -> float:
-    try:
-        return float(value)
-    except (TypeError, ValueError, OverflowError):
-        raise ValueError(f"{name} = {value!r} must be a number") from None
-
-
-def _whole(name: str, value: int, least: int) -> int:
-    try:
-        whole = operator.index(value)
-    except TypeError:
-        raise ValueError(f"{name} = {value!r} must be a whole number") from None
-    if not least <= whole <= LARGEST:
-        raise ValueError(f"{name} = {whole} must be in [{least}, {LARGEST}]")
-    return whole

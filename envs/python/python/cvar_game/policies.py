@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
+from cvar_game._arguments import array_of, shown
+
 if TYPE_CHECKING:
     from cvar_game.worlds import World
 
@@ -18,8 +20,8 @@ VIEWS = ("coordinates", "features")
 
 def features_of(observation: str) -> bool:
     """Whether an ``observation`` option means features."""
-    if observation not in VIEWS:
-        raise ValueError(f"observation = {observation!r}: use 'coordinates' or 'features'")
+    if not isinstance(observation, str) or observation not in VIEWS:
+        raise ValueError(f"observation = {shown(observation)}: use 'coordinates' or 'features'")
     return observation == "features"
 
 
@@ -32,7 +34,11 @@ def chooser(policy: Any, world: World) -> Callable[[Array], Array]:
     if hasattr(policy, "predict"):
 
         def ask(observations: Array) -> Any:
-            return policy.predict(observations, deterministic=True)[0]
+            answer = policy.predict(observations, deterministic=True)
+            try:
+                return answer[0]
+            except (IndexError, KeyError, TypeError):
+                raise ValueError("predict(observations) must return (actions, state)") from None
 
     elif callable(policy):
         ask = policy
@@ -49,7 +55,9 @@ def chooser(policy: Any, world: World) -> Callable[[Array], Array]:
 
 def as_actions(actions: Any, count: int | None, slots: int) -> Array:
     """Actions as the array that the worlds take, for so many slots."""
-    array = np.asarray(actions)
+    array = array_of("actions", actions)
+    if not array.flags.aligned:
+        array = array.copy()
     if array.dtype == np.int64 and array.shape == (slots,) and count is not None:
         return array
     shape = (slots,) if count is not None else (slots, 2)

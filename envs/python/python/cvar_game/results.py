@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from cvar_game import _core
+from cvar_game._arguments import eta_of, number, numbers, seed_of, whole
 from cvar_game.worlds import World, as_table
 
 if TYPE_CHECKING:
@@ -77,7 +78,7 @@ class Run:
         Returns:
             The action, or the batch of them, and ``state``.
         """
-        seen = np.ascontiguousarray(observation, dtype=np.float32)
+        seen = numbers("observations", observation).astype(np.float32)
         if seen.ndim not in (1, 2):
             raise ValueError(f"observations must have one or two dimensions, got {seen.ndim}")
         seed = None if deterministic else int(self._random.integers(2**63))
@@ -86,7 +87,7 @@ class Run:
 
     def seed(self, seed: int) -> None:
         """Seeds the actions that are drawn."""
-        self._random = np.random.default_rng(seed)
+        self._random = np.random.default_rng(seed_of(seed))
 
     def table(self) -> npt.NDArray[np.float64] | None:
         """The protagonist's action probabilities, shape ``(states, actions)``, or
@@ -131,8 +132,10 @@ def record(
     """
     from cvar_game.yardsticks import evaluate
 
-    if steps < 0 or not np.isfinite(seconds) or seconds < 0:
-        raise ValueError(f"steps = {steps} and seconds = {seconds} must not be negative")
+    steps, seed = whole("steps", steps, 0, 2**63 - 1), seed_of(seed)
+    seconds, eta, gamma = number("seconds", seconds), eta_of(eta), number("gamma", gamma)
+    if not 0.0 <= seconds < np.inf:
+        raise ValueError(f"seconds = {seconds} must be a finite number of at least 0")
     for name in ("observation", "time", "opponent", "episodes", "num_envs"):
         options.setdefault(name, _DEFAULTS[name])
     known = {name: options.pop(name) for name in _DEFAULTS}
@@ -140,17 +143,17 @@ def record(
     found = evaluate(policy, world, eta, gamma=gamma, **known)
     sampled = None
     if not callable(policy) and not hasattr(policy, "predict"):
-        sampled = world._core.judge_table(as_table(policy), float(eta), gamma, None).sampled
+        sampled = world._core.judge_table(as_table(policy), eta, gamma, None).sampled
     _core.write_run(
         Path(out),
         world._core,
         found.law,
         method=method,
-        eta=float(eta),
+        eta=eta,
         gamma=gamma,
         seed=seed,
         steps=steps,
-        seconds=float(seconds),
+        seconds=seconds,
         clearance=found.clearance,
         sampled=sampled,
     )

@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from cvar_game import _core
+from cvar_game._arguments import number, numbers, shown
 
 if TYPE_CHECKING:
     from cvar_game.results import Run
@@ -37,9 +38,9 @@ class World:
 
     def __init__(self, name: str, **constants: Any) -> None:
         try:
-            changes = json.dumps(constants, default=_plain)
-        except TypeError as error:
-            raise ValueError(f"a constant is neither number, text nor list: {error}") from None
+            changes = json.dumps(constants, default=_plain, allow_nan=False)
+        except (TypeError, ValueError, RecursionError, MemoryError) as error:
+            raise ValueError(f"a constant is neither number, text nor list: {shown(error)}") from None
         self._core = _core.World(name, changes)
         described = json.loads(self._core.describe())
         self.name: str = described["name"]
@@ -108,31 +109,33 @@ Opponent = Union[None, str, "os.PathLike[str]", WorstCase, "Run"]
 run (its antagonist), by itself or by its folder."""
 
 
+def is_nominal(opponent: Opponent) -> bool:
+    """Whether it is chance itself."""
+    return opponent is None or (isinstance(opponent, str) and opponent == "nominal")
+
+
 def core_opponent(opponent: Opponent) -> _core.Opponent:
     """The opponent as the module's own."""
     from cvar_game.results import Run
 
-    if opponent is None or opponent == "nominal":
+    if is_nominal(opponent):
         return _core.Opponent.nominal()
     if isinstance(opponent, WorstCase):
         policy = opponent.policy
         table = policy.table() if isinstance(policy, Run) else policy
-        return _core.Opponent.worst_case(as_table(table), opponent.gamma)
+        return _core.Opponent.worst_case(as_table(table), number("gamma", opponent.gamma))
     if isinstance(opponent, Run):
         return _core.Opponent.trained(opponent.folder)
     if isinstance(opponent, (str, os.PathLike)):
         return _core.Opponent.trained(opponent)
     raise ValueError(
-        f"opponent = {opponent!r}: use None, a WorstCase, or a finished run or its folder"
+        f"opponent = {shown(opponent)}: use None, a WorstCase, or a finished run or its folder"
     )
 
 
 def as_table(policy: object) -> npt.NDArray[np.float64]:
     """Action probabilities as an array of real numbers."""
-    try:
-        table = np.ascontiguousarray(policy, dtype=np.float64)
-    except (TypeError, ValueError):
-        raise ValueError("a policy table must be an array of action probabilities") from None
+    table = numbers("a policy table", policy)
     if table.ndim not in (2, 3):
         raise ValueError(
             f"a policy table must have shape (states, actions) or (horizon, states, actions), got "

@@ -15,8 +15,9 @@ import numpy as np
 import numpy.typing as npt
 
 from cvar_game import _core
+from cvar_game._arguments import MOST_EPISODES, eta_of, number, seed_of, whole
 from cvar_game.policies import chooser, features_of
-from cvar_game.worlds import Opponent, World, WorstCase, as_table, core_opponent
+from cvar_game.worlds import Opponent, World, WorstCase, as_table, core_opponent, is_nominal
 
 if TYPE_CHECKING:
     from cvar_game.results import Run
@@ -148,10 +149,11 @@ def exact(
         ValueError: If nothing is known, or an argument is out of range.
     """
     world = World.of(world, constants)
+    eta, gamma = eta_of(eta), number("gamma", gamma)
     details = json.loads(world._core.exact(eta, gamma, compute))
     best = details.get("optimal_cvar", details.get("certified_cvar"))
     policy = world._core.optimal_policy(eta, gamma)
-    return Exact(world.name, float(eta), 1.0 / eta, float(best), policy, details)
+    return Exact(world.name, eta, 1.0 / eta, float(best), policy, details)
 
 
 def evaluate(
@@ -202,14 +204,15 @@ def evaluate(
         raise ValueError("evaluate(policy, world, eta): give the world and the budget")
     else:
         world = World.of(world, constants)
-    eta = float(eta)
+    eta, gamma = eta_of(eta), number("gamma", gamma)
+    episodes = whole("episodes", episodes, 1, MOST_EPISODES)
     is_table = not callable(policy) and not hasattr(policy, "predict")
     setting: dict[str, Any] = {
         "eta": eta,
         "gamma": gamma,
         "episodes": episodes,
-        "slots": num_envs,
-        "seed": seed,
+        "slots": whole("num_envs", num_envs, 1, MOST_EPISODES),
+        "seed": seed_of(seed),
         "features": features_of(observation),
         "time": time,
     }
@@ -249,7 +252,7 @@ def _of_table(table: Array, world: World) -> Any:
 
 
 def _require_tail(eta: float, episodes: int) -> None:
-    least = math.ceil(LEAST_TAIL * eta)
+    least = math.ceil(LEAST_TAIL * min(eta, 1e300))
     if episodes < least:
         raise ValueError(
             f"episodes = {episodes} leaves fewer than {LEAST_TAIL} in the tail of CVaR at eta = {eta:g}; "
@@ -324,7 +327,7 @@ def worst_case(
         policy's action, shape ``(horizon, states, outcomes)``. Their mean under the nominal law is 1.
     """
     world = World.of(world, constants)
-    table = as_table(policy)
+    table, eta, gamma = as_table(policy), eta_of(eta), number("gamma", gamma)
     ratios = world._core.worst_case(table, eta, gamma)
     return world._core.judge_table(table, eta, gamma, None).law.cvar(1.0 / eta), ratios
 
@@ -357,10 +360,11 @@ def exploitability(
         world = World.of(world, constants)
     if protagonist is None:
         raise ValueError(f"the exploitability in {world.name} is not known: it has no finite states")
-    if antagonist is None or antagonist == "nominal":
+    if is_nominal(antagonist):
         raise ValueError("give an antagonist: a trained run, or the worst case of a policy")
+    eta, gamma = eta_of(eta), number("gamma", gamma)
     opponent = core_opponent(antagonist)
-    judged = world._core.judge_table(as_table(protagonist), float(eta), gamma, opponent)
+    judged = world._core.judge_table(as_table(protagonist), eta, gamma, opponent)
     if judged.regret is None or judged.exploitability is None:
         raise ValueError("the best response to this antagonist is not known")
     gain, error = judged.response_gain, judged.response_error
