@@ -129,9 +129,15 @@ impl Markdown {
         let mut found = Markdown::default();
         let (mut block, mut prose) = (String::new(), String::new());
         let (mut fenced, mut blank, mut indented) = (false, true, false);
+        // The tests of the Python package run its blocks.
+        let mut python = false;
         for line in text.lines() {
-            if line.trim_start().starts_with("```") {
+            if let Some(language) = line.trim_start().strip_prefix("```") {
                 fenced = !fenced;
+                python = language == "python";
+                continue;
+            }
+            if fenced && python {
                 continue;
             }
             indented = line.starts_with("    ") && (blank || indented);

@@ -4,9 +4,9 @@
 //! [`Training`], which proceeds update by update and can be saved and restored between two of them, and it
 //! ends with [`Players`], which are all that evaluation, yardsticks, tables and figures need.
 
+pub use super::arena::Arena;
+
 use super::device::Device;
-use super::family::Perturbed;
-use super::head::HeadOf;
 use super::inputs::Inputs;
 use super::observation::Observation;
 use super::options::TrainOptions;
@@ -15,26 +15,7 @@ use super::state::Unfit;
 use super::weights::WeightsError;
 use crate::game::budget::Eta;
 use lava_envs::World;
-use lava_envs::action::{Action, ActionKind};
 use lava_envs::random::ChaCha8Rng;
-
-/// A world that can be trained in: its actions have a policy, its law of chance has a family of
-/// perturbations. Every world is one whose action and law are of a known kind.
-pub trait Arena:
-    World<
-        Action: Action<Kind: HeadOf<<Self as World>::Action> + ActionKind<Noise: Perturbed>>,
-        Law: Perturbed,
-    >
-{
-}
-
-impl<W> Arena for W where
-    W: World<
-            Action: Action<Kind: HeadOf<<W as World>::Action> + ActionKind<Noise: Perturbed>>,
-            Law: Perturbed,
-        >
-{
-}
 
 /// Everything that determines a training run, except the world and the method.
 #[derive(Debug, Clone)]

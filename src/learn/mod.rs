@@ -16,6 +16,7 @@
 //! | what training continues from | [`state`] |
 
 pub mod adam;
+pub mod arena;
 pub mod budget_sensitivity;
 pub mod device;
 pub mod family;

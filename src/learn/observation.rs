@@ -24,9 +24,9 @@
 //! k = 1, 2, 4: octaves from half a wave per arena (Konidaris, Osentoski & Thomas 2011, with sines beside
 //! the cosines, one coordinate at a time).
 
+use super::arena::Arena;
 use super::head::HeadOf;
 use super::inputs::{Columns, Inputs};
-use super::method::Arena;
 use super::options::{CriticSees, TrainOptions, View};
 use super::policy::{DrawSituation, Situation};
 use crate::game::budget::{Budget, Eta};
