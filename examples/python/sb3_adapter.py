@@ -4,7 +4,7 @@
     model = stable_baselines3.PPO("MlpPolicy", env)
 
 Stable-Baselines3 steps a list of environments one after the other. This class hands it the native batch in
-their place, which takes all its steps in one call.
+their place, whose slots take a step together in one call.
 """
 
 from __future__ import annotations
@@ -28,7 +28,10 @@ class LavaVecEnv(VecEnv):
     """
 
     def __init__(self, world: Any, num_envs: int = 250, **options: Any) -> None:
-        self.batch = LavaVectorEnv(num_envs, world, autoreset_mode="SameStep", **options)
+        # A learner needs no more of the infos than the last observation of an episode.
+        self.batch = LavaVectorEnv(
+            num_envs, world, autoreset_mode="SameStep", info=False, **options
+        )
         self.render_mode = self.batch.render_mode
         super().__init__(
             num_envs, self.batch.single_observation_space, self.batch.single_action_space

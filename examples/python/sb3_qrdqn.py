@@ -17,7 +17,6 @@ import argparse
 import time
 from typing import Any
 
-import numpy as np
 import torch
 from sb3_adapter import LavaVecEnv
 from sb3_contrib import QRDQN
@@ -52,11 +51,11 @@ def train(seed: int, steps: int = STEPS, verbose: int = 0) -> QRDQN:
     return model.learn(steps, log_interval=2_000)
 
 
-def table(model: QRDQN, tail: float = 1.0) -> np.ndarray[Any, Any]:
+def table(model: QRDQN, tail: float = 1.0) -> Any:
     """A policy as a table: the action whose lowest quantiles, a share of all, have the best mean."""
     lowest = max(1, round(tail * QUANTILES))
 
-    def choose(observations: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
+    def choose(observations: Any) -> Any:
         with torch.no_grad():
             quantiles = model.quantile_net(torch.as_tensor(observations)).sort(dim=1).values
         return quantiles[:, :lowest].mean(dim=1).argmax(dim=1).numpy()

@@ -245,9 +245,11 @@ const METHOD_COLUMNS: [Column; 2] = [
 const SETTINGS_COLUMN: Column =
     ("settings", |of| Field::Text(of.run.label.clone().unwrap_or_default()));
 
-/// The columns that runs of former versions do not fill; left out where no run does.
-const LATER_COLUMNS: [&str; 5] =
-    ["evaluation_seconds", "class_regret", "response_gain", "response_error", "exploitability"];
+/// Groups of columns that runs of former versions do not fill; one is left out where no run fills any of it.
+const LATER_COLUMNS: [&[&str]; 2] = [
+    &["evaluation_seconds"],
+    &["class_regret", "response_gain", "response_error", "exploitability"],
+];
 
 /// The other columns, in order.
 const COLUMNS: [Column; 36] = [
@@ -370,11 +372,15 @@ impl Runs {
 
     /// The text of `runs.csv`.
     pub fn to_csv(&self) -> String {
-        let filled = |get: fn(&Facts) -> Field| {
+        let filled = |name: &&str| {
+            let column = COLUMNS.iter().find(|(of, _)| of == name);
+            let (_, get) = column.expect("the columns have it");
             self.runs.iter().any(|run| !get(&Facts::of(run)).text().is_empty())
         };
         let mut columns = COLUMNS.to_vec();
-        columns.retain(|(name, get)| !LATER_COLUMNS.contains(name) || filled(*get));
+        for group in LATER_COLUMNS.iter().filter(|group| !group.iter().any(filled)) {
+            columns.retain(|(name, _)| !group.contains(name));
+        }
         if !self.are_plain() {
             columns.splice(1..1, METHOD_COLUMNS);
         }

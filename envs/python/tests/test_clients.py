@@ -19,13 +19,19 @@ from conftest import WORLDS
 import cvar_game
 
 IDS = {"lava-grid": "cvar_game/LavaGrid-v0", "lava-point": "cvar_game/LavaPoint-v0"}
-VIEWS = ({}, {"observation": "features"}, {"observation": "features", "time": True}, {"time": True})
+VIEWS: tuple[dict[str, Any], ...] = (
+    {},
+    {"observation": "features"},
+    {"observation": "features", "time": True},
+    {"time": True},
+)
 EXAMPLES = Path(__file__).parents[3] / "examples" / "python"
 
 
 def library(name: str) -> ModuleType:
     """A library, or a reason to skip: also where it is installed and cannot be loaded."""
-    return pytest.importorskip(name, exc_type=ImportError)
+    module: ModuleType = pytest.importorskip(name, exc_type=ImportError)
+    return module
 
 
 def example(name: str, monkeypatch: pytest.MonkeyPatch) -> ModuleType:

@@ -574,7 +574,7 @@ def test_bad_arguments_are_refused(name: str, calls: Calls, repeat: Any) -> None
     # Files that cannot be read are said to be so.
     allowed = (OSError,) if name == "mdp_of_csv" else ()
 
-    @fuzzed(examples=12)
+    @fuzzed(examples=10)
     @hypothesis.given(st.data())
     def test(data: Any) -> None:
         options = dict(good)
@@ -609,13 +609,16 @@ def operations(draw: Any, kinds: list[str]) -> Any:
 
 OBSERVED = ["lava-grid", "lava-point"]
 
+# Their episodes end after two steps.
+SMALL: dict[str, dict[str, Any]] = {"lava-grid": {"map": "S.G"}, "lava-point": {}}
+
 
 @pytest.mark.parametrize("name", OBSERVED)
 def test_an_environment_refuses_and_goes_on(name: str, repeat: Any) -> None:
-    world = World(name)
+    world = World(name, horizon=2, **SMALL[name])
     good = good_action(world, None)
 
-    @fuzzed(examples=25)
+    @fuzzed(examples=20)
     @hypothesis.given(st.data())
     def test(data: Any) -> None:
         env = cvar_game.LavaEnv(world, render_mode="ansi", eta=1.0)
@@ -644,11 +647,11 @@ def test_an_environment_refuses_and_goes_on(name: str, repeat: Any) -> None:
 @pytest.mark.parametrize("mode", list(AutoresetMode))
 @pytest.mark.parametrize("name", OBSERVED)
 def test_a_batch_refuses_and_goes_on(name: str, mode: AutoresetMode, repeat: Any) -> None:
-    world = World(name)
+    world = World(name, horizon=2, **SMALL[name])
     good = good_action(world, 3)
     shape = good.shape
 
-    @fuzzed(examples=40)
+    @fuzzed(examples=30)
     @hypothesis.given(st.data())
     def test(data: Any) -> None:
         env = cvar_game.LavaVectorEnv(3, world, render_mode="ansi", eta=1.0, autoreset_mode=mode)
@@ -691,12 +694,12 @@ def test_a_restored_slot_can_be_played(name: str, repeat: Any) -> None:
     env.step(good_action(world, 2))
     saved = env.snapshot(0)
 
-    @fuzzed(examples=40)
+    @fuzzed(examples=30)
     @hypothesis.given(mutations(saved))
     def test(snapshot: bytes) -> None:
         if attempt("restore", env.restore, 0, snapshot):
             return
-        for _ in range(45):
+        for _ in range(30):
             attempt("step", env.step, good_action(world, 2))
         attempt("render", env._games.positions)
         env.restore(0, env.snapshot(0))
@@ -706,10 +709,10 @@ def test_a_restored_slot_can_be_played(name: str, repeat: Any) -> None:
 
 @pytest.mark.parametrize("name", OBSERVED)
 def test_a_game_refuses_and_goes_on(name: str, repeat: Any) -> None:
-    world = World(name)
+    world = World(name, horizon=2, **SMALL[name])
     good = [good_action(world, None), None]
 
-    @fuzzed(examples=25)
+    @fuzzed(examples=20)
     @hypothesis.given(st.data())
     def test(data: Any) -> None:
         game = LavaGame(world, eta=2.0, render_mode="ansi")
@@ -742,7 +745,7 @@ def test_a_game_refuses_and_goes_on(name: str, repeat: Any) -> None:
 def test_bad_answers_of_policies_are_refused(name: str, repeat: Any) -> None:
     shapes = [(5,), (5, 1), (5, 2), (70,), (70, 1)]
 
-    @fuzzed(examples=25)
+    @fuzzed(examples=20)
     @hypothesis.given(bad(*shapes), st.sampled_from(["function", "predict", "pair"]))
     def test(answer: Any, kind: str) -> None:
         policy: Any = lambda _: answer  # noqa: E731
@@ -764,7 +767,7 @@ def numbers(draw: Any) -> Any:
 
 
 def test_bad_transitions_are_refused(repeat: Any) -> None:
-    @fuzzed(examples=25)
+    @fuzzed(examples=20)
     @hypothesis.given(st.data())
     def test(data: Any) -> None:
         rows: list[Any] = [list(row) for row in COIN]
@@ -808,7 +811,7 @@ CSV = b"idstatefrom,idaction,idstateto,probability,reward\n1,1,1,0.5,1.0\n1,1,2,
 
 
 def test_bad_csv_is_refused(tmp_path: Path, repeat: Any) -> None:
-    @fuzzed(examples=40)
+    @fuzzed(examples=30)
     @hypothesis.given(st.one_of(mutations(CSV), st.binary(), st.text().map(lambda text: text.encode("utf-8", "replace"))))
     def test(content: bytes) -> None:
         path = tmp_path / "mdp\n.csv"
@@ -819,7 +822,7 @@ def test_bad_csv_is_refused(tmp_path: Path, repeat: Any) -> None:
 
 
 def test_bad_tables_of_environments_are_refused(repeat: Any) -> None:
-    @fuzzed(examples=40)
+    @fuzzed(examples=30)
     @hypothesis.given(st.data())
     def test(data: Any) -> None:
         table: Any = {s: {a: [(0.5, 0, 1.0, False), (0.5, 1, 0.0, True)] for a in range(2)} for s in range(2)}
@@ -853,7 +856,7 @@ def test_broken_runs_are_refused(name: str, file: str, runs: Path, tmp_path: Pat
     shutil.copytree(folder_of(runs, name), folder)
     original = (folder / file).read_bytes()
 
-    @fuzzed(examples=25)
+    @fuzzed(examples=20)
     @hypothesis.given(mutations(original))
     def test(content: bytes) -> None:
         (folder / file).write_bytes(content)
@@ -875,7 +878,7 @@ def test_broken_results_are_refused(file: str, runs: Path, tmp_path: Path, repea
     path = folder_of(tmp_path / "results", "lava-grid") / file
     original = path.read_bytes()
 
-    @fuzzed(examples=40)
+    @fuzzed(examples=30)
     @hypothesis.given(mutations(original))
     def test(content: bytes) -> None:
         path.write_bytes(content)
@@ -950,7 +953,7 @@ def test_the_native_module_refuses_bad_arguments(name: str, calls: Calls, repeat
     function, args, named = known[name]
     assert not attempt(name, function, *args, **named)
 
-    @fuzzed(examples=12)
+    @fuzzed(examples=10)
     @hypothesis.given(st.data())
     def test(data: Any) -> None:
         given: list[Any] = list(args)
