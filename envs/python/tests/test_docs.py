@@ -1,8 +1,8 @@
 """The documents say what happens: their blocks are run, and what they show is what was printed.
 
 A block ``python`` is run in the namespace of those before it. A block ``text`` that follows it is its output. A block
-``sh`` is run if each of its lines is a command of ``cvar-game``. The lines of a block that begins with ``# slow`` need
-minutes or another library: they are run by ``pytest -m slow``, and their output may differ between machines.
+``sh`` is run if each of its lines is a command of ``cvar-game``. These, and blocks that begin with ``# slow``, need
+minutes or another library: they are run by ``pytest -m slow``, and what they print may differ between machines.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ class Block:
 
     @property
     def slow(self) -> bool:
-        return self.text.startswith("# slow")
+        return self.language == "sh" or self.text.startswith("# slow")
 
 
 def blocks(text: str) -> Iterator[Block]:
