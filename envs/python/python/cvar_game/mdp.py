@@ -443,11 +443,11 @@ class Player:
             ValueError: If the episode has ended there, the time is up, or no episode of the MDP has
                 accumulated what was observed.
         """
-        return self.optimum.action(self.time, self.accumulated, int(state))
+        return self.optimum.action(self.time, self.accumulated, whole("state", state, 0, LARGEST))
 
     def observe(self, reward: float) -> None:
         """Takes note of the reward of the step."""
-        self.accumulated += self.optimum.gamma**self.time * float(reward)
+        self.accumulated += self.optimum.gamma**self.time * number("reward", reward)
         self.time += 1
 
 

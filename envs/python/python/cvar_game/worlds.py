@@ -37,11 +37,8 @@ class World:
     """
 
     def __init__(self, name: str, **constants: Any) -> None:
-        try:
-            changes = json.dumps(constants, default=_plain, allow_nan=False)
-        except (TypeError, ValueError, RecursionError, MemoryError) as error:
-            raise ValueError(f"a constant is neither number, text nor list: {shown(error)}") from None
-        self._core = _core.World(name, changes)
+        changes = ",".join(_entry(key, value) for key, value in constants.items())
+        self._core = _core.World(name, f"{{{changes}}}")
         described = json.loads(self._core.describe())
         self.name: str = described["name"]
         """The name."""
@@ -77,6 +74,19 @@ class World:
                 raise ValueError("give constants to the World, not to this function")
             return world
         return cls(world, **constants)
+
+
+def _entry(name: str, value: object) -> str:
+    """A constant as an entry of an object of JSON."""
+    if not name.isprintable():
+        raise ValueError(f"there is no constant {shown(name)}")
+    try:
+        text = json.dumps({name: value}, default=_plain, allow_nan=False, ensure_ascii=False)
+        if value is not None and text.encode():
+            return text[1:-1]
+    except (TypeError, ValueError, RecursionError, MemoryError):
+        pass
+    raise ValueError(f"{name} = {shown(value)} must be a finite number, text, or a list of them")
 
 
 def _plain(value: object) -> object:
