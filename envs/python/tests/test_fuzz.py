@@ -594,6 +594,27 @@ def is_path_elsewhere(value: Any) -> bool:
     return isinstance(value, (str, bytes, os.PathLike)) and str(value)[:1] in ("/", ".")
 
 
+@pytest.mark.usefixtures("limits")
+def test_what_memory_cannot_hold_is_refused() -> None:
+    rows = ["S" + "." * 998 + "G", *["." * 1000] * 999]
+    large = World("lava-grid", map="\n".join(rows), horizon=1_000_000)
+    seen = {"observation": "features"}
+    assert attempt("batch", cvar_game.LavaVectorEnv, 1_000_000, large, **seen)
+    assert attempt("tabulate", cvar_game.tabulate, up, large, **seen)
+    assert attempt("tabulate", cvar_game.tabulate, up, large, time=True)
+    options = {"episodes": 1_000_000, "num_envs": 1_000_000}
+    assert attempt("evaluate", cvar_game.evaluate, up, large, 1.0, **options, **seen)
+    assert attempt("evaluate", cvar_game.evaluate, np.broadcast_to(0.25, (10**6, 10**6, 4)), large, 1.0)
+    assert attempt("exact", cvar_game.exact, large, 1.0)
+    for count in (0, -1, 10_000_001, 2**40, 2**64, 10**30):
+        assert attempt("batch", cvar_game.LavaVectorEnv, count)
+        assert attempt("evaluate", cvar_game.evaluate, up, "lava-grid", 1.0, episodes=count)
+        assert attempt("evaluate", cvar_game.evaluate, up, "lava-grid", 1.0, episodes=10, num_envs=count)
+    # One state has many actions, so that a policy of shape (T, S, A) has more numbers than the MDP.
+    many = FiniteMDP([(s, a, s, 1.0, 0.0) for s in range(1_000) for a in range(1 if s else 10_000)], horizon=1_000)
+    assert attempt("evaluate", many.evaluate, np.zeros((1_000, 1_000), int))
+
+
 # Environments: a refused call changes nothing.
 
 
@@ -964,6 +985,7 @@ def test_the_native_module_refuses_bad_arguments(name: str, calls: Calls, repeat
             value = data.draw(bad((2,), (2, 2), (2, 4), (5,), instead=instead))
             hypothesis.assume(not SLOW.get(str(key), lambda _: False)(value))
             # The functions of the package look at sizes.
+            hypothesis.assume(not isinstance(value, range))
             hypothesis.assume(not isinstance(value, np.ndarray) or value.size < 2**30)
             hypothesis.assume(name != "write_run" or key != 0 or not is_path_elsewhere(value))
             if isinstance(key, int):

@@ -59,6 +59,12 @@ def eta_of(value: object) -> float:
     return eta
 
 
+def require_room(rows: int, width: int) -> None:
+    """Refuses more observations than memory should hold."""
+    if rows * width > MOST_NUMBERS:
+        raise ValueError(f"{rows} observations of {width} numbers are too many to be held; use fewer")
+
+
 def array_of(name: str, values: object) -> npt.NDArray[Any]:
     """An array of any type."""
     try:

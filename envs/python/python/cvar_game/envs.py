@@ -21,7 +21,7 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
 from cvar_game import _core
-from cvar_game._arguments import MOST_EPISODES, MOST_NUMBERS, array_of, eta_of, seed_of, shown, whole
+from cvar_game._arguments import MOST_EPISODES, array_of, eta_of, require_room, seed_of, shown, whole
 from cvar_game.policies import as_actions, features_of
 from cvar_game.rendering import ansi
 from cvar_game.worlds import Opponent, World, core_opponent, is_nominal
@@ -229,9 +229,7 @@ class LavaVectorEnv(gym.vector.VectorEnv[Array, Any, Array]):
         self.world = World.of(world, constants)
         self.num_envs = num_envs
         self.single_observation_space = observation_space(self.world, observation, time)
-        width = self.single_observation_space.shape[0]
-        if num_envs * width > MOST_NUMBERS:
-            raise ValueError(f"num_envs = {num_envs} observations of {width} numbers are too many to be held")
+        require_room(num_envs, self.single_observation_space.shape[0])
         self.single_action_space = action_space(self.world)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
@@ -350,11 +348,13 @@ def _each(rows: Array, ended: Array) -> Array:
 
 
 def _autoreset_mode(mode: str | AutoresetMode) -> AutoresetMode:
-    try:
-        return mode if isinstance(mode, AutoresetMode) else AutoresetMode(mode)
-    except ValueError:
-        names = ", ".join(repr(of.value) for of in AutoresetMode)
-        raise ValueError(f"autoreset_mode = {shown(mode)}: use one of {names}") from None
+    modes = {of.value: of for of in AutoresetMode}
+    if isinstance(mode, AutoresetMode):
+        return mode
+    if isinstance(mode, str) and mode in modes:
+        return modes[mode]
+    names = ", ".join(map(repr, modes))
+    raise ValueError(f"autoreset_mode = {shown(mode)}: use one of {names}")
 
 
 def _reset_mask(mask: Any, slots: int) -> Array:

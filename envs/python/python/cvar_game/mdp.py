@@ -40,7 +40,7 @@ from typing import TYPE_CHECKING, Any, Union
 import numpy as np
 import numpy.typing as npt
 
-from cvar_game._arguments import array_of, number, numbers, shown, whole
+from cvar_game._arguments import MOST_NUMBERS, array_of, number, numbers, shown, whole
 from cvar_game._core import Law, Mdp, Optimum
 
 if TYPE_CHECKING:
@@ -406,6 +406,8 @@ class FiniteMDP:
                 f"policy[{', '.join(map(str, place))}] = {array[place]} is no action: state {place[-1]} has "
                 f"{counts[place[-1]]}"
             )
+        if array.size * self.actions > MOST_NUMBERS:
+            raise ValueError(f"the policy has too many numbers as probabilities: {array.size} x {self.actions}")
         chosen = array[..., np.newaxis] == np.arange(self.actions)
         return np.ascontiguousarray(chosen, dtype=np.float64)
 

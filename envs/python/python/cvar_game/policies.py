@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from cvar_game._arguments import array_of, shown
+from cvar_game._arguments import MOST_NUMBERS, array_of, require_room, shown
 
 if TYPE_CHECKING:
     from cvar_game.worlds import World
@@ -101,10 +101,18 @@ def tabulate(
     if world.states is None or world.actions is None:
         raise ValueError(f"{world.name} has no finite number of states")
     choose = chooser(policy, world)
+    times = world.horizon if time else 1
+    if times * world.states * world.actions > MOST_NUMBERS:
+        raise ValueError(f"the table is too large: {times} x {world.states} x {world.actions}")
+    require_room(world.states, world._core.sight_width(features_of(observation), time))
     tables = []
-    for at in range(world.horizon if time else 1):
+    for at in range(times):
         seen = world._core.sights(features_of(observation), time, at)
         table = np.zeros((world.states, world.actions))
-        table[np.arange(world.states), choose(seen)] = 1.0
+        chosen = choose(seen)
+        wrong = chosen[(chosen < 0) | (chosen >= world.actions)]
+        if len(wrong) > 0:
+            raise ValueError(f"action {wrong[0]} does not exist; use 0 to {world.actions - 1}")
+        table[np.arange(world.states), chosen] = 1.0
         tables.append(table)
     return np.stack(tables) if time else tables[0]

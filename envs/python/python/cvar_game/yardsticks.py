@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from cvar_game import _core
-from cvar_game._arguments import MOST_EPISODES, eta_of, number, seed_of, whole
+from cvar_game._arguments import MOST_EPISODES, eta_of, number, require_room, seed_of, whole
 from cvar_game.policies import chooser, features_of
 from cvar_game.worlds import Opponent, World, WorstCase, as_table, core_opponent, is_nominal
 
@@ -195,7 +195,7 @@ def evaluate(
 
     if isinstance(policy, Run):
         run = policy
-        world = run.world if world is None else World.of(world, constants)
+        world = World.of(run.world if world is None else world, constants)
         eta = run.eta if eta is None else eta
         observation, time = run.observation, run.time
         table = run.table()
@@ -216,14 +216,16 @@ def evaluate(
         "features": features_of(observation),
         "time": time,
     }
+    if is_table:
+        setting["features"], setting["time"] = world.actions is not None and world.states is not None, True
     if not is_table or opponent is not None:
         _require_tail(eta, episodes)
+        width = world._core.sight_width(setting["features"], setting["time"])
+        require_room(min(setting["slots"], episodes), width)
     clearance = None
     if is_table:
         judged = world._core.judge_table(as_table(policy), eta, gamma, None)
         played = _of_table(as_table(policy), world)
-        setting["features"] = world.actions is not None and world.states is not None
-        setting["time"] = True
     else:
         played = chooser(policy, world)
         law, _, least = world._core.play(played, opponent=None, **setting)
@@ -351,7 +353,7 @@ def exploitability(
     from cvar_game.results import Run
 
     if isinstance(protagonist, Run):
-        world = protagonist.world if world is None else World.of(world, constants)
+        world = World.of(protagonist.world if world is None else world, constants)
         eta = protagonist.eta if eta is None else eta
         protagonist = protagonist.table()
     elif world is None or eta is None:
