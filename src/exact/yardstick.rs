@@ -169,6 +169,33 @@ pub struct Comparison {
     pub exploitability: Option<Exploitability>,
 }
 
+impl Comparison {
+    /// A policy of which only recorded episodes are known, compared with an optimum of a standard error; `None`
+    /// if there are no such episodes.
+    fn of_episodes(
+        eta: f64,
+        (optimum, optimum_error): (f64, f64),
+        evidence: &Evidence<'_>,
+    ) -> Option<Self> {
+        let alpha = 1.0 / eta;
+        let nominal = evidence.nominal?;
+        let (cvar, error) = (nominal.cvar(alpha), nominal.cvar_standard_error(alpha));
+        let (antagonist_gap, antagonist_gap_standard_error) =
+            evidence.opposed.map_or((0.0, 0.0), |law| {
+                (law.mean() - cvar, law.mean_standard_error().hypot(error))
+            });
+        Some(Comparison {
+            optimum,
+            regret: optimum - cvar,
+            regret_standard_error: error.hypot(optimum_error),
+            antagonist_gap,
+            antagonist_gap_standard_error,
+            class_regret: None,
+            exploitability: None,
+        })
+    }
+}
+
 /// How much the better deviation of one player improves on V*(eta), in the sense of the paper's Definition 2:
 ///
 ///   epsilon = max(V* - CVaR_{1/eta} of the greedy policy, best response to the antagonist - V*).
@@ -370,9 +397,11 @@ impl<W: World> Yardstick for Exact<W> {
         eta: f64,
         evidence: &Evidence<'_>,
     ) -> Result<Option<Comparison>, YardstickError> {
-        let Some(policy) = evidence.policy else { return Ok(None) };
-        let sampled = policy.on(&self.world)?;
         let optimum = self.optimum(eta)?;
+        let Some(policy) = evidence.policy else {
+            return Ok(Comparison::of_episodes(eta, (optimum.cvar, 0.0), evidence));
+        };
+        let sampled = policy.on(&self.world)?;
         let found = self.world.certificate(&optimum, &sampled, eta)?;
         let class = if policy.sees_time() { None } else { Some(self.stationary(eta)?) };
         let neutral = Response { value: optimum.cvar, error: 0.0 };
@@ -514,21 +543,8 @@ impl Yardstick for Oracle {
         evidence: &Evidence<'_>,
     ) -> Result<Option<Comparison>, YardstickError> {
         let alpha = require_eta(eta)?;
-        let (Some(oracle), Some(nominal)) = (self.certified(eta, &())?, evidence.nominal) else {
-            return Ok(None);
-        };
-        let (cvar, error) = (nominal.cvar(alpha), nominal.cvar_standard_error(alpha));
-        let (antagonist_gap, value_error) = evidence
-            .opposed
-            .map_or((0.0, None), |law| (law.mean() - cvar, Some(law.mean_standard_error())));
-        Ok(Some(Comparison {
-            optimum: oracle.certified_cvar,
-            regret: oracle.certified_cvar - cvar,
-            regret_standard_error: error.hypot(oracle.law.cvar_standard_error(alpha)),
-            antagonist_gap,
-            antagonist_gap_standard_error: value_error.map_or(0.0, |value| value.hypot(error)),
-            class_regret: None,
-            exploitability: None,
-        }))
+        let Some(oracle) = self.certified(eta, &())? else { return Ok(None) };
+        let error = oracle.law.cvar_standard_error(alpha);
+        Ok(Comparison::of_episodes(eta, (oracle.certified_cvar, error), evidence))
     }
 }

@@ -13,7 +13,8 @@ mod values;
 mod worlds;
 
 use cvar_game::cli;
-use cvar_game::experiment::artefacts::{Evaluation, Findings, Play};
+use cvar_game::exact::yardstick::Comparison;
+use cvar_game::experiment::artefacts::{Certificate, Evaluation, Findings, Play};
 use cvar_game::experiment::config::RunConfig;
 use cvar_game::experiment::names::RunId;
 use cvar_game::experiment::registry;
@@ -50,7 +51,9 @@ type Returned<'py> =
 
 /// Bad input.
 fn invalid(message: impl Into<String>) -> PyErr {
-    PyValueError::new_err(message.into())
+    let message: String = message.into();
+    // In one line, also where a path or a name of the user's has several.
+    PyValueError::new_err(message.split_whitespace().collect::<Vec<_>>().join(" "))
 }
 
 /// The same for a result.
@@ -367,36 +370,58 @@ fn configuration(folder: &Path) -> PyResult<RunConfig> {
 }
 
 /// A policy compared with the best.
-#[pyclass(frozen, get_all, module = "cvar_game._core")]
+#[pyclass(frozen, module = "cvar_game._core")]
 struct Judged {
     /// The law of the greedy policy's return.
+    #[pyo3(get)]
     law: Law,
     /// That of the policy that draws its actions.
+    #[pyo3(get)]
     sampled: Option<Law>,
-    optimum: Option<f64>,
-    regret: Option<f64>,
-    regret_standard_error: Option<f64>,
-    class_regret: Option<f64>,
-    exploitability: Option<f64>,
-    response_gain: Option<f64>,
-    response_error: Option<f64>,
+    comparison: Option<Comparison>,
 }
 
 impl From<worlds::Judged> for Judged {
     fn from(of: worlds::Judged) -> Self {
-        let found = of.comparison;
-        let pair = found.and_then(|found| found.exploitability);
-        Judged {
-            law: Law(of.law),
-            sampled: of.sampled.map(Law),
-            optimum: found.map(|found| found.optimum),
-            regret: found.map(|found| found.regret),
-            regret_standard_error: found.map(|found| found.regret_standard_error),
-            class_regret: found.and_then(|found| found.class_regret),
-            exploitability: pair.map(|pair| pair.epsilon),
-            response_gain: pair.map(|pair| pair.response_gain),
-            response_error: pair.map(|pair| pair.response_error),
-        }
+        Judged { law: Law(of.law), sampled: of.sampled.map(Law), comparison: of.comparison }
+    }
+}
+
+#[pymethods]
+impl Judged {
+    #[getter]
+    fn optimum(&self) -> Option<f64> {
+        self.comparison.map(|found| found.optimum)
+    }
+
+    #[getter]
+    fn regret(&self) -> Option<f64> {
+        self.comparison.map(|found| found.regret)
+    }
+
+    #[getter]
+    fn regret_standard_error(&self) -> Option<f64> {
+        self.comparison.map(|found| found.regret_standard_error)
+    }
+
+    #[getter]
+    fn class_regret(&self) -> Option<f64> {
+        self.comparison?.class_regret
+    }
+
+    #[getter]
+    fn exploitability(&self) -> Option<f64> {
+        Some(self.comparison?.exploitability?.epsilon)
+    }
+
+    #[getter]
+    fn response_gain(&self) -> Option<f64> {
+        Some(self.comparison?.exploitability?.response_gain)
+    }
+
+    #[getter]
+    fn response_error(&self) -> Option<f64> {
+        Some(self.comparison?.exploitability?.response_error)
     }
 }
 
@@ -670,12 +695,12 @@ impl Run {
 /// Writes what the greedy protagonist of a method of Python's attains, as a finished run of a results folder, and
 /// returns the run's own folder. `method` may have a variant: `METHOD/VARIANT`.
 #[pyfunction]
-#[pyo3(signature = (out, world, law, *, method, eta, gamma, seed, steps, seconds, clearance, sampled=None))]
+#[pyo3(signature = (out, world, judged, *, method, eta, gamma, seed, steps, seconds, clearance))]
 #[expect(clippy::too_many_arguments, reason = "Python names them")]
 fn write_run(
     out: PathBuf,
     world: &World,
-    law: &Law,
+    judged: &Judged,
     method: &str,
     eta: f64,
     gamma: f64,
@@ -683,7 +708,6 @@ fn write_run(
     steps: u64,
     seconds: f64,
     clearance: Option<f64>,
-    sampled: Option<&Law>,
 ) -> PyResult<PathBuf> {
     let text = |error: &dyn std::fmt::Display| invalid(error.to_string());
     let (method, variant) = match method.split_once('/') {
@@ -703,9 +727,10 @@ fn write_run(
         law: law.0.clone(),
         mean_clearance,
     };
-    let mut plays = vec![play(Mode::Greedy, law, clearance)];
-    plays.extend(sampled.map(|law| play(Mode::Sampled, law, None)));
-    let findings = Findings { plays, audit: None, certificate: None };
+    let mut plays = vec![play(Mode::Greedy, &judged.law, clearance)];
+    plays.extend(judged.sampled.as_ref().map(|law| play(Mode::Sampled, law, None)));
+    let certificate = judged.comparison.map(Certificate::from);
+    let findings = Findings { plays, audit: None, certificate };
     let evaluation = Evaluation::new(&run, (steps, seconds), findings);
     let folder = run.folder(&out);
     let mut task = toml::Table::new();

@@ -915,6 +915,7 @@ def test_broken_results_are_refused(file: str, runs: Path, tmp_path: Path, repea
 def natively(calls: Calls) -> dict[str, tuple[Any, list[Any], dict[str, Any]]]:
     """Functions of the native module and their good arguments."""
     world, law = calls.grid._core, calls.law
+    judged = world.judge_table(TABLE, 2.0, 1.0, None)
     games = _core.Games(
         world, slots=2, features=False, time=False, eta=2.0, autoreset="next-step",
         opponent=_core.Opponent.played("auto", 1, 4.0, 50.0),
@@ -948,7 +949,7 @@ def natively(calls: Calls) -> dict[str, tuple[Any, list[Any], dict[str, Any]]]:
         "Games.restore": (games.restore, [0, games.snapshot(0)], {}),
         "Run": (_core.Run, [calls.run.folder], {}),
         "Run.act": (calls.run._core.act, [seen, 1], {}),
-        "write_run": (_core.write_run, [calls.folder / "out", world, law], finished),
+        "write_run": (_core.write_run, [calls.folder / "out", world, judged], finished),
         "read_results": (_core.read_results, [calls.runs], {}),
         "Mdp": (
             _core.Mdp,

@@ -65,6 +65,8 @@ def test_a_played_policy_agrees_with_its_table() -> None:
         middle, half = (low + high) / 2, (high - low) / 2
         assert abs(getattr(exact, name) - middle) < 2.5 * half, name
     assert exact.antagonist_gap is not None and abs(exact.antagonist_gap) < 0.02
+    assert played.optimum == exact.optimum and played.regret_interval is not None
+    assert played.regret_interval[0] < 0.0 < played.regret_interval[1]
     assert cvar_game.regret(table, "lava-grid", 25) == pytest.approx(0.0, abs=1e-12)
 
 
@@ -129,12 +131,15 @@ def test_recorded_policies_enter_the_table(runs: Path, tmp_path: Path) -> None:
     def push(seen: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
         return np.tile([0.1, 1.0], (len(seen), 1))
 
+    stationary = cvar_game.record(best.policy[0], "lava-grid", 25, tmp_path, **{**record, "seed": 2})
     with_variant = {**record, "method": "push/up", "episodes": 1_000}
     cvar_game.record(push, "lava-point", 25, tmp_path, noise=1.0, **with_variant)
     frame = cvar_game.results(tmp_path)
-    assert list(frame["method"]) == ["optimal", "push"] and list(frame["variant"])[1] == "up"
+    assert list(frame["method"]) == ["optimal", "optimal", "push"] and list(frame["variant"])[2] == "up"
     assert frame["regret"][0] == pytest.approx(0.0, abs=1e-6)
-    assert list(frame["steps"]) == [12_345] * 2 and list(frame["seconds"]) == [6.5] * 2
+    assert stationary.class_regret is not None
+    assert frame["class_regret"][1] == pytest.approx(stationary.class_regret, abs=1e-6)
+    assert list(frame["steps"]) == [12_345] * 3 and list(frame["seconds"]) == [6.5] * 3
     table = program("table", str(runs), "--compare", str(tmp_path))
     assert "optimal" in table and "push/up" in table
 

@@ -6,7 +6,7 @@ Arrays must have the given type exactly; ``SupportsFloat`` and the like are not 
 from collections.abc import Callable, Sequence
 from os import PathLike
 from pathlib import Path
-from typing import Any, final, type_check_only
+from typing import Any, final
 
 import numpy as np
 import numpy.typing as npt
@@ -16,6 +16,7 @@ __all__ = [
     "Judged",
     "Law",
     "Mdp",
+    "MdpWorstCase",
     "Opponent",
     "Optimum",
     "Run",
@@ -270,8 +271,6 @@ class Optimum:
     def worst_case(self, eta: float) -> MdpWorstCase:
         """The worst case of the policy."""
 
-# The module has it, but not its name.
-@type_check_only
 @final
 class MdpWorstCase:
     """The worst that chance can do to a deterministic policy within a budget."""
@@ -312,7 +311,7 @@ def worlds_of() -> list[str]: ...
 def write_run(
     out: _Folder,
     world: World,
-    law: Law,
+    judged: Judged,
     *,
     method: str,
     eta: float,
@@ -321,6 +320,5 @@ def write_run(
     steps: int,
     seconds: float,
     clearance: float | None,
-    sampled: Law | None = None,
 ) -> Path: ...
 def read_results(folder: _Folder) -> tuple[str, list[str]]: ...

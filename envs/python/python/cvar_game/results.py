@@ -141,13 +141,10 @@ def record(
     known = {name: options.pop(name) for name in _DEFAULTS}
     world = World.of(world, options)
     found = evaluate(policy, world, eta, gamma=gamma, **known)
-    sampled = None
-    if not callable(policy) and not hasattr(policy, "predict"):
-        sampled = world._core.judge_table(as_table(policy), eta, gamma, None).sampled
     _core.write_run(
         Path(out),
         world._core,
-        found.law,
+        found._judged,
         method=method,
         eta=eta,
         gamma=gamma,
@@ -155,7 +152,6 @@ def record(
         steps=steps,
         seconds=seconds,
         clearance=found.clearance,
-        sampled=sampled,
     )
     return found
 

@@ -94,8 +94,10 @@ class Evaluation:
     """``game_value - cvar``: what the opponent leaves to the worst case."""
     law: _core.Law = field(repr=False)
     """The law of the return: values, probabilities, CVaR at any level."""
-    clearance: float | None = None
-    """Mean over the played episodes of the least distance to lava (cells or metres)."""
+    clearance: float | None
+    """Mean over the played episodes of the least distance to lava (cells or metres); ``None`` where none were
+    played."""
+    _judged: _core.Judged = field(repr=False, compare=False)
 
     def __str__(self) -> str:
         kind = "exact" if self.episodes is None else f"{self.episodes:,} episodes"
@@ -295,6 +297,7 @@ def _evaluation(
         antagonist_gap=None if game_value is None else game_value - cvar,
         law=law,
         clearance=clearance,
+        _judged=judged,
     )
 
 
