@@ -14,7 +14,7 @@ use cvar_game::learn::head::{
 };
 use cvar_game::learn::inputs::{Columns, Inputs, Selection};
 use cvar_game::learn::method::{Arena, Players, Progress, Setting, TrainError, Training};
-use cvar_game::learn::methods::game::{GameTraining, schedule};
+use cvar_game::learn::methods::game::GameTraining;
 use cvar_game::learn::network::{Network, Outputs, Shape};
 use cvar_game::learn::observation::Observation;
 use cvar_game::learn::options::{
@@ -27,6 +27,7 @@ use cvar_game::learn::play::{Play, Played, play};
 use cvar_game::learn::policy::{Draw, Mode, Nominal, Situation};
 use cvar_game::learn::ppo::{Loss, Sample};
 use cvar_game::learn::rollout::{Collector, Terms};
+use cvar_game::learn::schedule::schedule;
 use cvar_game::learn::state::TrainingState;
 use cvar_game::learn::weights::{self, Weights};
 use lava_envs::action::Discrete;

@@ -106,7 +106,8 @@ Examples:
   cvar-game bench --config configs/quick.toml --jobs 1 --set 'experiment.seeds=[1]' --out /tmp/try
   cvar-game bench --config configs/paper.toml --only lava-grid/game/eta-25/seed-3")]
 pub struct BenchArgs {
-    /// Configuration file [default: configs/quick.toml, which is embedded in the program].
+    /// Configuration file; those of the repository's configs/ are embedded in the program [default:
+    /// configs/quick.toml].
     #[arg(long, value_name = "FILE")]
     pub config: Option<PathBuf>,
     /// Output folder [default: results/ and the name of the configuration file].

@@ -180,10 +180,9 @@ impl Comparison {
         let alpha = 1.0 / eta;
         let nominal = evidence.nominal?;
         let (cvar, error) = (nominal.cvar(alpha), nominal.cvar_standard_error(alpha));
-        let (antagonist_gap, antagonist_gap_standard_error) =
-            evidence.opposed.map_or((0.0, 0.0), |law| {
-                (law.mean() - cvar, law.mean_standard_error().hypot(error))
-            });
+        let (antagonist_gap, antagonist_gap_standard_error) = evidence
+            .opposed
+            .map_or((0.0, 0.0), |law| (law.mean() - cvar, law.mean_standard_error().hypot(error)));
         Some(Comparison {
             optimum,
             regret: optimum - cvar,

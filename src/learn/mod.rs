@@ -4,6 +4,8 @@
 //! |---|---|
 //! | Algorithm 1, the alternating loop | [`methods::game`] |
 //! | what a method is | [`method`] |
+//! | whose turn an update is, and at which budget | [`schedule`] |
+//! | methods without an antagonist | [`solo`] |
 //! | what a policy and an opponent are, however they were trained | [`policy`] |
 //! | one step of the game in a batch, and whole episodes | [`vector_game`], [`play`] |
 //! | PPO and its loss | [`ppo`], [`gae`] |
@@ -35,6 +37,8 @@ pub mod policy;
 pub mod ppo;
 pub mod price;
 pub mod rollout;
+pub mod schedule;
+pub mod solo;
 pub mod state;
 pub mod trajectories;
 pub mod truncated_normal;

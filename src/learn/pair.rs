@@ -12,6 +12,7 @@ use super::policy::{
     Response, Situation, Streams,
 };
 use super::ppo::Player;
+use super::vector_game::Spending;
 use super::weights::{self, Weights, WeightsError};
 use crate::game::columns::{Column, SAMPLES};
 use lava_envs::random::{ChaCha8Rng, Purpose, stream};
@@ -38,6 +39,9 @@ pub struct Pair<W: Arena> {
     pub observation: Observation,
     /// Whether the antagonist follows its network, or plays at random.
     pub adversary: Adversary,
+    /// What the antagonist's budget is for. One of single steps is not the game's, and such an antagonist is no
+    /// opponent in evaluation.
+    pub spending: Spending,
     device: Device,
 }
 
@@ -73,7 +77,22 @@ impl<W: Arena> Pair<W> {
             )
         });
         let adversary = options.adversary;
-        Pair { protagonist, antagonist, action_antagonist, observation, adversary, device }
+        let spending = Spending::default();
+        Pair {
+            protagonist,
+            antagonist,
+            action_antagonist,
+            observation,
+            adversary,
+            spending,
+            device,
+        }
+    }
+
+    /// The same, with budgets for this.
+    #[must_use]
+    pub fn spending(self, spending: Spending) -> Self {
+        Pair { spending, ..self }
     }
 
     /// Parameters of a player's networks; empty for an absent one.
@@ -106,6 +125,9 @@ impl<W: Arena> Players<W> for Pair<W> {
     }
 
     fn opponent(&self) -> Option<Box<dyn Opponent<W> + '_>> {
+        if self.spending == Spending::Step {
+            return None;
+        }
         Some(Box::new(Pair::opponent(self, true)?))
     }
 

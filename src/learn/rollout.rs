@@ -9,7 +9,7 @@ use super::policy::{Draw, Mode, Noise, Nominal, Opponent, Streams};
 use super::price::Finished;
 use super::state::{GamesState, SlotState, Unfit};
 use super::trajectories::Trajectories;
-use super::vector_game::VectorGame;
+use super::vector_game::{Spending, VectorGame};
 use crate::game::budget::{Budget, Eta};
 use crate::game::columns::logarithms;
 use crate::game::returns::{Atom, ReturnSoFar};
@@ -32,15 +32,15 @@ pub struct Collector<W: World> {
     pub antagonist: Played<W::Law>,
     /// What its half on the protagonist's draw recorded; empty if it did not play.
     pub action_antagonist: Played<Noise<W>>,
-    /// The return of each slot's episode before each of these draws, `[steps, slots]`; `None` in one that
-    /// started anywhere.
-    pub before_draws: Vec<Option<ReturnSoFar>>,
+    /// The return of each slot's episode before each step, `[steps, slots]`; `None` in one that started anywhere.
+    pub before: Vec<Option<ReturnSoFar>>,
     /// Episodes that ended in the last rollout, without those that started anywhere; their masses have no
     /// meaning.
     pub finished: Vec<Atom>,
     /// The same episodes with prod delta.
     pub weighted: Vec<Finished>,
-    /// max prod delta / eta over all trajectories so far, at most 1 up to rounding.
+    /// max prod delta / eta over all trajectories so far, at most 1 up to rounding; 0 where budgets are those of
+    /// single steps.
     pub budget_use: f64,
 }
 
@@ -78,11 +78,18 @@ impl<W: Arena> Collector<W> {
             protagonist: Trajectories::new(slots),
             antagonist: Trajectories::new(slots),
             action_antagonist: Trajectories::new(slots),
-            before_draws: Vec::new(),
+            before: Vec::new(),
             finished: Vec::new(),
             weighted: Vec::new(),
             budget_use: 0.0,
         }
+    }
+
+    /// The same, with budgets for this.
+    #[must_use]
+    pub fn spending(mut self, spending: Spending) -> Self {
+        self.game.spending = spending;
+        self
     }
 
     /// Plays the steps of a rollout in every slot; an episode that ends is followed by a new one.
@@ -90,7 +97,7 @@ impl<W: Arena> Collector<W> {
         self.protagonist.clear();
         self.antagonist.clear();
         self.action_antagonist.clear();
-        self.before_draws.clear();
+        self.before.clear();
         self.finished.clear();
         self.weighted.clear();
         let mut policy = PpoPolicy::new(&pair.protagonist, pair.observation);
@@ -162,6 +169,9 @@ impl<W: Arena> Collector<W> {
             record.choices.push(choice);
             record.rewards.push(game.steps[slot].reward as f32);
             record.ended.push(game.steps[slot].end.is_some());
+            // The world counts this step already.
+            let explored = game.world.time(slot) != self.so_far[slot].steps + 1;
+            self.before.push((!explored).then_some(self.so_far[slot]));
         }
         let chosen = record.choices.len() - game.slots();
         policy.log_probabilities(&record.choices[chosen..], &mut record.log_probabilities);
@@ -208,9 +218,6 @@ impl<W: Arena> Collector<W> {
             record.log_probabilities.push(log_probability);
             record.rewards.push(-game.steps[slot].reward as f32);
             record.ended.push(game.steps[slot].end.is_some());
-            // The world counts this step already.
-            let explored = game.world.time(slot) != self.so_far[slot].steps + 1;
-            self.before_draws.push((!explored).then_some(self.so_far[slot]));
         }
     }
 
@@ -226,7 +233,10 @@ impl<W: Arena> Collector<W> {
                 let (value, likelihood_ratio) = (self.so_far[slot].value, self.products[slot]);
                 self.weighted.push(Finished { value, likelihood_ratio });
             }
-            self.budget_use = self.budget_use.max(self.products[slot] / self.start[slot].get());
+            if self.game.spending == Spending::Trajectory {
+                let used = self.products[slot] / self.start[slot].get();
+                self.budget_use = self.budget_use.max(used);
+            }
             self.begin(slot, terms);
         }
     }

@@ -13,6 +13,16 @@ use super::policy::{
 use crate::game::budget::{Budget, Eta};
 use lava_envs::{Law, Outcome, Step, World};
 
+/// What a budget is for.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum Spending {
+    /// The whole trajectory: what a step spends is gone (Eq. 5 of the paper).
+    #[default]
+    Trajectory,
+    /// Every step anew, sup `delta_t` <= eta: the bounded adversary that the paper argues against.
+    Step,
+}
+
 /// A batch of games and what happened in its last step; vectors have an entry per slot.
 pub struct VectorGame<W: World> {
     /// The world.
@@ -21,6 +31,8 @@ pub struct VectorGame<W: World> {
     pub streams: Vec<Streams>,
     /// Remaining budgets eta_t, after the last step.
     pub budgets: Vec<Budget>,
+    /// What the budgets are for.
+    pub spending: Spending,
     /// Slots that take no part in the next steps.
     pub idle: Vec<bool>,
     /// Laws of the noise behind the draws of the last step; empty where the opponent left them alone.
@@ -55,6 +67,7 @@ impl<W: World> VectorGame<W> {
             world,
             streams,
             budgets: vec![neutral; slots],
+            spending: Spending::default(),
             idle: vec![false; slots],
             noise_laws: Vec::new(),
             noise: Vec::new(),
@@ -101,7 +114,7 @@ impl<W: World> VectorGame<W> {
         let situation = Situation { world, actions, laws, budgets };
         opponent.respond(&situation, draw, &mut self.streams, Response { outcomes, ratios });
         for (slot, budget) in self.budgets.iter_mut().enumerate() {
-            if !self.idle[slot] {
+            if !self.idle[slot] && self.spending == Spending::Trajectory {
                 *budget = self.budgets_before[slot].spend(self.ratios[slot]); // Eq. 5
             }
         }

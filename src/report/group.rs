@@ -204,6 +204,13 @@ pub fn groups(runs: &Runs) -> Vec<Group<'_>> {
     (runs.runs.chunk_by(same)).map(|of| Group::new(method(&of[0]), of, alphas(of))).collect()
 }
 
+/// The policies that the runs can be compared with, each a group of one.
+pub fn references(runs: &Runs) -> Vec<Group<'_>> {
+    let alphas = |of: &Run| ALPHAS.into_iter().chain([of.alpha()]).collect();
+    let name = |of: &Run| Some(of.name.method.clone());
+    (runs.references.chunks(1)).map(|of| Group::new(name(&of[0]), of, alphas(&of[0]))).collect()
+}
+
 impl<'a> Group<'a> {
     fn new(method: Option<String>, runs: &'a [Run], alphas: Vec<f64>) -> Self {
         let (env, eta) = (runs[0].name.world.as_str(), runs[0].name.eta);
@@ -302,6 +309,31 @@ impl<'a> Group<'a> {
             })
             .collect();
         Some((statistics::paired_difference(&differences)?, differences.len()))
+    }
+
+    /// CVaR at this group's alpha minus that of a policy which is not one of several seeds, mean over the runs.
+    pub fn above(&self, reference: &Group) -> Option<Estimate> {
+        let own = self.level(self.alpha());
+        let known = reference.cvar_at(self.alpha())?;
+        self.mean(|measures| Some(measures.cvar[own]? - known))
+    }
+
+    /// Share of the runs whose CVaR at this group's alpha is above that of such a policy; a failed run's is not.
+    pub fn share_above(&self, reference: &Group) -> Option<Estimate> {
+        let own = self.level(self.alpha());
+        let known = reference.cvar_at(self.alpha())?;
+        self.estimate(|measures| {
+            let scores = ranked(measures, &|measures| measures.cvar[own])?;
+            let better: Vec<f64> =
+                scores.iter().map(|&of| f64::from(u8::from(of > known))).collect();
+            statistics::mean(&better)
+        })
+    }
+
+    /// CVaR at one of its levels, of a group of one run.
+    fn cvar_at(&self, alpha: f64) -> Option<f64> {
+        let place = self.alphas.iter().position(|&level| level == alpha)?;
+        self.measures.first()?.cvar[place]
     }
 
     /// Probability that a run of this group has a better CVaR at this group's alpha than a run of

@@ -39,7 +39,7 @@ fn environment(table: &Table, world: &World, block: Block) -> String {
     let align: String =
         headings.iter().map(|&of| if Some(of) == table.heading { 'l' } else { 'r' }).collect();
     let mut lines = vec![titles.map(escaped).collect::<Vec<String>>()];
-    for row in &world.rows {
+    for row in render::rows(world, &columns) {
         let (count, failed) = render::seeds(row);
         let mut values: Vec<String> =
             row_name(table, row).iter().map(|name| escaped(name)).chain([count]).collect();

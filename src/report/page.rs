@@ -4,7 +4,7 @@
 
 use super::Worlds;
 use super::figures::{Figures, Panel, Picture};
-use super::render::{columns, legend, row_headings, row_name, seeds, words};
+use super::render::{columns, legend, row_headings, row_name, rows, seeds, words};
 use super::runs::Run;
 use super::table::{Block, Cell, Row, Table, World};
 use crate::experiment::figure_data::StoredEpisode;
@@ -68,7 +68,7 @@ fn summary(table: &Table) -> Markup {
             "It should maximise CVaR at alpha = 1/eta: the mean of its worst returns." }
         @for world in &table.worlds {
             h3 { (world.name) }
-            ul { @for row in &world.rows { li { (sentence(table, row)) } } }
+            ul { @for row in &world.rows { @if !row.reference { li { (sentence(table, row)) } } } }
         }
     }
 }
@@ -125,7 +125,7 @@ fn one_table(table: &Table, world: &World, block: Block) -> Markup {
                 }
             } }
             tbody {
-                @for row in &world.rows {
+                @for row in rows(world, &columns) {
                     tr {
                         @for name in row_name(table, row) { td data-value=(name) { (name) } }
                         @let (count, failed) = seeds(row);

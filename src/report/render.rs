@@ -39,6 +39,16 @@ pub(super) fn columns(world: &World, block: Block) -> Vec<(usize, &'static Colum
     COLUMNS.iter().enumerate().filter(shown).collect()
 }
 
+/// The rows that have a number in these columns, and all that were trained.
+pub(super) fn rows<'a>(
+    world: &'a World,
+    columns: &'a [(usize, &'static Column)],
+) -> impl Iterator<Item = &'a Row> {
+    let number =
+        |row: &Row| columns.iter().any(|&(place, _)| !matches!(row.cells[place], Cell::Missing));
+    world.rows.iter().filter(move |row| !row.reference || number(row))
+}
+
 /// Headings of what stands before the columns: which row it is.
 pub(super) fn row_headings(table: &Table) -> Vec<&'static str> {
     std::iter::once("eta").chain(table.heading).chain(["seeds"]).collect()
@@ -70,6 +80,11 @@ pub fn legend(table: &Table, mark: &str) -> Vec<(String, String)> {
         let text = "the best value of its column in the world, or one whose interval reaches into that \
                     of the best; what is measured at level 1/eta is compared within an eta alone";
         legend.push((mark.to_owned(), text.to_owned()));
+    }
+    if table.worlds.iter().flat_map(|world| &world.rows).any(|row| row.reference) {
+        let text = "the best policy that is known at the row's eta, or at eta = 1: on lava-grid there is no better one \
+                    (optimum); on lava-point it is a certified controller, and a better one may exist (oracle)";
+        legend.push(("rows without seeds".to_owned(), text.to_owned()));
     }
     for world in &table.worlds {
         legend.push((world.name.clone(), format!("{}. {}", world.episodes, world.checks)));
@@ -111,7 +126,7 @@ fn fixed(value: f64, decimals: usize) -> String {
 
 pub(super) fn seeds(row: &Row) -> (String, Option<String>) {
     let failed = (row.failures > 0).then(|| format!("{} failed", row.failures));
-    (row.seeds.to_string(), failed)
+    (if row.reference { String::new() } else { row.seeds.to_string() }, failed)
 }
 
 /// The columns of text of the terminal that standard output is, from 80 to 140; 100 where it is none.
@@ -173,24 +188,25 @@ impl Terminal {
         let name_width = (self.width / 3).max(1);
         let mut head: Vec<Vec<String>> =
             vec![row_headings(table).into_iter().map(str::to_owned).collect()];
-        for row in &world.rows {
+        let rows: Vec<&Row> = rows(world, columns).collect();
+        for row in &rows {
             let (count, failed) = seeds(row);
             let count = failed.map_or(count.clone(), |failed| format!("{count}\n{failed}"));
             let name = row_name(table, row).into_iter().map(|name| folded(&name, name_width));
             head.push(name.chain([count]).collect());
         }
         let cells = |&(place, column): &(usize, &'static Column)| -> Vec<String> {
-            let cell = |row: &Row| {
+            let cell = |row: &&Row| {
                 let (value, below) = words(column.format, row.cells[place]);
                 let value = value + if row.best[place] { BEST } else { "" };
                 below.map_or(value.clone(), |below| format!("{value}\n{below}"))
             };
-            std::iter::once(column.title.to_owned()).chain(world.rows.iter().map(cell)).collect()
+            std::iter::once(column.title.to_owned()).chain(rows.iter().map(cell)).collect()
         };
         let columns: Vec<(usize, &'static Column, Vec<String>)> =
             columns.iter().map(|of| (of.0, of.1, cells(of))).collect();
         for (place, column, _) in &columns {
-            for row in &world.rows {
+            for row in &rows {
                 shown.best |= row.best[*place];
                 shown.missing |= row.cells[*place] == Cell::Missing;
                 shown.interval |=
@@ -340,7 +356,7 @@ impl Render for Markdown {
                 let mut lines: Vec<Vec<String>> = vec![
                     row_headings(table).into_iter().chain(titles).map(str::to_owned).collect(),
                 ];
-                for row in &world.rows {
+                for row in rows(world, &columns) {
                     let cells = columns.iter().map(|&(place, column)| {
                         let (value, after) = words(column.format, row.cells[place]);
                         let value = if row.best[place] { format!("**{value}**") } else { value };

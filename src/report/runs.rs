@@ -308,6 +308,9 @@ pub struct Runs {
     /// Finished and failed runs, by method and variant (plain runs of the method `game` first), world, eta
     /// and seed. Never empty.
     pub runs: Vec<Run>,
+    /// What is best for each task of the runs at each of its budgets, and the risk-neutral best measured there:
+    /// runs that nothing trained, without a seed of their own.
+    pub references: Vec<Run>,
     /// What was found and left out.
     pub notes: Vec<String>,
 }
@@ -361,7 +364,8 @@ impl Runs {
         for of_world in runs.chunk_by_mut(|a, b| line(a) == line(b)) {
             notes.extend(tell_apart(of_world));
         }
-        Ok(Runs { runs, notes })
+        let references = references(&runs, &mut tasks);
+        Ok(Runs { runs, references, notes })
     }
 
     /// Whether all are of the method `game` without a variant and of one kind of settings, so that rows
@@ -525,6 +529,60 @@ impl Tasks<'_> {
             Optimum::Refused(why) => Regret::Refused(why.clone()),
             Optimum::None => Regret::None,
         }
+    }
+}
+
+/// What the best risk-neutral policy's name ends with, away from eta = 1.
+pub(super) const AT_NEUTRAL: &str = " at eta = 1";
+
+/// See [`Runs::references`].
+fn references(runs: &[Run], tasks: &mut Tasks) -> Vec<Run> {
+    let mut references: Vec<Run> = Vec::new();
+    for run in runs {
+        let (world, task, eta) = (&run.name.world, &run.settings.task, run.name.eta);
+        let known = |of: &Run| of.name.world == *world && of.settings.task == *task;
+        if references.iter().any(|of| known(of) && of.name.eta == eta) {
+            continue;
+        }
+        for best_at in [eta, 1.0] {
+            let Optimum::Known(law) = tasks.optimum(world, task, best_at) else { continue };
+            references.push(reference(run, law.clone(), best_at));
+            if eta == 1.0 {
+                break;
+            }
+        }
+    }
+    references
+}
+
+/// A policy that is the best at a budget, measured at that of a run of the same task.
+fn reference(run: &Run, law: ReturnLaw, best_at: f64) -> Run {
+    let whose = if law.episodes().is_none() { "optimum" } else { "oracle" };
+    let method =
+        if best_at == run.name.eta { whose.to_owned() } else { format!("{whose}{AT_NEUTRAL}") };
+    let (protagonist, chance, mean_clearance) = (Mode::Greedy, Chance::Nominal, None);
+    let evaluation = Evaluation {
+        schema: SCHEMA,
+        env: run.name.world.clone(),
+        eta: run.name.eta,
+        seed: 0,
+        steps: 0,
+        seconds: 0.0,
+        plays: vec![Play { protagonist, chance, law, mean_clearance }],
+        audit: None,
+        certificate: None,
+    };
+    Run {
+        name: RunName { method, variant: None, seed: 0, ..run.name.clone() },
+        failure: None,
+        steps: 0,
+        seconds: 0.0,
+        evaluation: Some(evaluation),
+        regret: Regret::None,
+        settings: run.settings.clone(),
+        label: None,
+        manifest: None,
+        files: run.files.clone(),
     }
 }
 

@@ -9,10 +9,11 @@
 //! Best values are marked by interval, not by digit: the best value of a column and all those whose
 //! interval reaches into its interval.
 
-use super::group::{Group, groups};
-use super::runs::{Regret, Run, Runs};
+use super::group::{Group, groups, references};
+use super::runs::{AT_NEUTRAL, Regret, Run, Runs};
 use super::settings::{Settings, Task, listed};
 use super::statistics::{self, Estimate, Interval};
+use crate::experiment::archive::FIRST_METHOD;
 use crate::experiment::artefacts::{Audit, Chance};
 use crate::experiment::words::{counted, thousands};
 use crate::game::returns::ReturnLaw;
@@ -132,6 +133,8 @@ struct Others<'a> {
     neutral: Option<&'a Group<'a>>,
     /// The row of the first name at the same eta, if there are several names and the task is the same.
     first: Option<&'a Group<'a>>,
+    /// The best risk-neutral policy that is known of the same task.
+    best_neutral: Option<&'a Group<'a>>,
 }
 
 fn estimate(estimate: Option<Estimate>) -> Cell {
@@ -191,7 +194,7 @@ fn violations(group: &Group) -> Option<u64> {
 const LATER: [&str; 4] = ["class_regret", "exploitability", "response_gain", "evaluation_seconds"];
 
 /// The columns, in order. World, eta, alpha, seeds and failures stand before them in every format.
-pub static COLUMNS: [Column; 35] = [
+pub static COLUMNS: [Column; 37] = [
     Column {
         key: "mean",
         title: "mean",
@@ -363,6 +366,29 @@ pub static COLUMNS: [Column; 35] = [
         meaning: "probability that a run of the row beats a run of eta = 1 in CVaR at level 1/eta",
         brief: "probability that a run beats one that it is compared with",
         compute: |group, others| improvement(group, others.neutral),
+    },
+    Column {
+        key: "gain_best_neutral",
+        title: "gain over best",
+        blocks: &[Block::Game],
+        format: Format::Estimate(3),
+        best: Best::None,
+        meaning: "CVaR_1/eta minus CVaR at that same level of the best risk-neutral policy there is (lava-point: of \
+                  the oracle's): the gain that is due to risk aversion, not to the slack of the learned eta = 1 policy",
+        brief: "CVaR_1/eta over that of the best risk-neutral policy",
+        compute: |group, others| estimate(others.best_neutral.and_then(|best| group.above(best))),
+    },
+    Column {
+        key: "share_above_best_neutral",
+        title: "above best %",
+        blocks: &[],
+        format: Format::Percent,
+        best: Best::None,
+        meaning: "share of the seeds whose CVaR_1/eta is above that of the best risk-neutral policy",
+        brief: "",
+        compute: |group, others| {
+            estimate(others.best_neutral.and_then(|best| group.share_above(best)))
+        },
     },
     Column {
         key: "game_value",
@@ -574,6 +600,8 @@ pub struct Row {
     pub name: String,
     /// What tells its settings apart from others of the method and variant.
     pub settings: Option<String>,
+    /// Whether it is a policy that the others are compared with: no method trained it.
+    pub reference: bool,
     /// Rows of one number have the same task, and their values may be compared.
     task: usize,
     /// Number of seeds, failed ones included.
@@ -617,6 +645,8 @@ pub struct Results<'a> {
     name: String,
     /// Its runs, measured.
     pub groups: Vec<Group<'a>>,
+    /// The policies that those of its folder can be compared with; the folder's first results have them.
+    references: Vec<Group<'a>>,
     /// What its reader must know.
     notes: Vec<String>,
 }
@@ -641,17 +671,19 @@ impl<'a> Results<'a> {
             }
             let (heading, name) = match &group.method {
                 None if several => (Some("folder"), folder.to_owned()),
+                None if !runs.references.is_empty() => (Some("method"), FIRST_METHOD.to_owned()),
                 None => (None, folder.to_owned()),
                 Some(method) if several => (Some("folder"), format!("{folder}/{method}")),
                 Some(method) => (Some("method"), method.clone()),
             };
-            let (folder, notes) = (folder.to_owned(), Vec::new());
-            results.push(Results { heading, folder, name, groups: vec![group], notes });
+            let (folder, notes, references) = (folder.to_owned(), Vec::new(), Vec::new());
+            results.push(Results { heading, folder, name, groups: vec![group], references, notes });
         }
         let own = runs.runs.iter().flat_map(warnings).chain(runs.notes.iter().cloned());
         let said = |note| if several { format!("{folder}: {note}") } else { note };
         if let Some(first) = results.first_mut() {
             first.notes = own.map(said).collect();
+            first.references = references(runs);
         }
         results
     }
@@ -726,6 +758,8 @@ fn world(name: &str, results: &[Results]) -> World {
     let find = |results: &'_ Results<'_>, eta: f64| {
         results.groups.iter().position(|group| group.env == name && group.eta == eta)
     };
+    let known: Vec<&Group> =
+        results.iter().flat_map(|of| &of.references).filter(|group| group.env == name).collect();
     for of in results {
         for group in of.groups.iter().filter(|group| group.env == name) {
             let task = &group.runs[0].settings.task;
@@ -739,7 +773,12 @@ fn world(name: &str, results: &[Results]) -> World {
                 .and_then(|first| find(first, group.eta).map(|place| &first.groups[place]))
                 .filter(|first| first.runs[0].settings.task == *task);
             let neutral = find(of, 1.0).map(|place| &of.groups[place]);
-            let others = Others { neutral, first };
+            let best_neutral = known.iter().copied().find(|known| {
+                let run = &known.runs[0];
+                let same = known.eta == group.eta && run.settings.task == *task;
+                same && (group.eta == 1.0 || run.name.method.ends_with(AT_NEUTRAL))
+            });
+            let others = Others { neutral, first, best_neutral };
             rows.push(Row {
                 eta: group.eta,
                 folder: of.folder.clone(),
@@ -747,6 +786,7 @@ fn world(name: &str, results: &[Results]) -> World {
                 variant: group.runs[0].name.variant.clone(),
                 name: of.name.clone(),
                 settings: group.runs[0].label.clone(),
+                reference: false,
                 task: place,
                 seeds: group.runs.len(),
                 failures: group.failures(),
@@ -755,6 +795,39 @@ fn world(name: &str, results: &[Results]) -> World {
             });
             all.push(group);
         }
+    }
+    let nobody = Others { neutral: None, first: None, best_neutral: None };
+    for group in &known {
+        let run = &group.runs[0];
+        let place = tasks.iter().position(|known| **known == run.settings.task);
+        let task = place.expect("the task of some row");
+        let twin = |row: &Row| {
+            row.reference
+                && row.task == task
+                && row.eta == group.eta
+                && row.method == run.name.method
+        };
+        if rows.iter().any(twin) {
+            continue;
+        }
+        let cell = |column: &Column| {
+            let shown = [Block::Returns, Block::Cross].iter().any(|of| column.blocks.contains(of));
+            if shown { (column.compute)(group, &nobody) } else { Cell::Missing }
+        };
+        rows.push(Row {
+            eta: group.eta,
+            folder: String::new(),
+            method: run.name.method.clone(),
+            variant: None,
+            name: run.name.method.clone(),
+            settings: None,
+            reference: true,
+            task,
+            seeds: 0,
+            failures: 0,
+            cells: COLUMNS.iter().map(cell).collect(),
+            best: vec![false; COLUMNS.len()],
+        });
     }
     // Stable: within an eta the names keep their order.
     rows.sort_by(|a, b| a.eta.total_cmp(&b.eta));
@@ -852,7 +925,8 @@ fn without_regret(world: &str, here: &[&Results]) -> Vec<String> {
 fn mark(rows: &mut [Row]) {
     let tasks = rows.iter().map(|row| row.task + 1).max().unwrap_or_default();
     for task in 0..tasks {
-        let mut rows: Vec<&mut Row> = rows.iter_mut().filter(|row| row.task == task).collect();
+        let trained = |row: &&mut Row| row.task == task && !row.reference;
+        let mut rows: Vec<&mut Row> = rows.iter_mut().filter(trained).collect();
         for (place, column) in COLUMNS.iter().enumerate() {
             match column.best {
                 Best::None => {}

@@ -45,10 +45,26 @@ impl Layer {
     }
 }
 
-/// A TOML file.
+/// The configurations of the repository, which the program carries: there they are no files.
+const EMBEDDED: &[(&str, &str)] = &[
+    ("configs/quick.toml", super::QUICK),
+    ("configs/paper.toml", include_str!("../../../configs/paper.toml")),
+    ("configs/paper-plain.toml", include_str!("../../../configs/paper-plain.toml")),
+    ("configs/paper-timeless.toml", include_str!("../../../configs/paper-timeless.toml")),
+    ("configs/coordinates.toml", include_str!("../../../configs/coordinates.toml")),
+    ("configs/ablations.toml", include_str!("../../../configs/ablations.toml")),
+    ("configs/methods.toml", include_str!("../../../configs/methods.toml")),
+];
+
+/// A TOML file, or the embedded one of that path where there is no such file.
 pub(super) fn read(path: &Path) -> Result<(String, Table), ConfigError> {
-    let text =
-        read_text(path).map_err(|source| ConfigError::Read { path: path.to_owned(), source })?;
+    let embedded = |source: std::io::Error| {
+        let known = EMBEDDED.iter().find(|(name, _)| Path::new(name) == path);
+        let missing = source.kind() == std::io::ErrorKind::NotFound;
+        let text = known.filter(|_| missing).map(|&(_, text)| text.to_owned());
+        text.ok_or_else(|| ConfigError::Read { path: path.to_owned(), source })
+    };
+    let text = read_text(path).or_else(embedded)?;
     let origin = path.display().to_string();
     let table = table(&origin, &text)?;
     Ok((origin, table))

@@ -9,15 +9,15 @@ use crate::learn::inputs::Inputs;
 use crate::learn::method::{
     Arena, Method, Metric, Players, Progress, Setting, TrainError, Training,
 };
-use crate::learn::options::{
-    Acts, Adversary, Credit, MOST_UPDATES, PlayerOptions, Role, TrainOptions,
-};
+use crate::learn::options::{Acts, Adversary, Credit, MOST_UPDATES, Role, TrainOptions};
 use crate::learn::pair::Pair;
 use crate::learn::policy::Mode;
-use crate::learn::ppo::{Losses, Rates, Signal};
+use crate::learn::ppo::{Losses, Signal};
 use crate::learn::price;
 use crate::learn::rollout::{Collector, Terms};
+use crate::learn::schedule::{Turn, roles, schedule};
 use crate::learn::state::{TrainingState, Unfit};
+use crate::learn::vector_game::Spending;
 use lava_envs::random::{ChaCha8Rng, Purpose, position, stream, stream_from};
 use lava_envs::{Action, End};
 
@@ -110,7 +110,7 @@ impl Method for Game {
 
 /// Training of a pair, update by update.
 pub struct GameTraining<'a, W: Arena> {
-    setting: &'a Setting<'a>,
+    setting: Setting<'a>,
     turns: Vec<Turn>,
     /// Updates done.
     done: usize,
@@ -122,20 +122,29 @@ pub struct GameTraining<'a, W: Arena> {
 
 impl<'a, W: Arena> GameTraining<'a, W> {
     /// Training from its beginning, on `world`, whose slots are the parallel episodes.
-    pub fn new(world: W, setting: &'a Setting<'a>) -> Self {
+    pub fn new(world: W, setting: &Setting<'a>) -> Self {
         GameTraining {
-            setting,
             turns: schedule(setting.options, setting.eta),
             done: 0,
             pair: Pair::new(&world, setting),
             collector: Collector::new(world, setting),
             minibatches: stream(setting.seed, Purpose::Minibatches, 0),
+            setting: setting.clone(),
         }
+    }
+
+    /// The same, with budgets for this.
+    #[must_use]
+    pub fn spending(self, spending: Spending) -> Self {
+        let (pair, collector) = (self.pair.spending(spending), self.collector.spending(spending));
+        GameTraining { pair, collector, ..self }
     }
 
     /// A rollout and the update of one player on it.
     fn turn(&mut self, turn: &Turn) -> Losses {
-        let Setting { gamma, options, .. } = *self.setting;
+        let Setting { gamma, options, .. } = self.setting;
+        // A budget of single steps is the same after whatever was spent.
+        let charged = options.budget_sensitivity && self.pair.spending == Spending::Trajectory;
         let GameTraining { pair, collector, minibatches, .. } = self;
         collector.collect(
             pair,
@@ -148,7 +157,7 @@ impl<'a, W: Arena> GameTraining<'a, W> {
                 let (its, rates, observation) = (&options.antagonist, turn.rates, pair.observation);
                 let mut by_draws = draws.estimates(drawn, gamma, its).advantages;
                 let mut by_outcomes = outcomes.estimates(played, gamma, its).advantages;
-                if options.budget_sensitivity {
+                if charged {
                     let more =
                         |inputs: &mut Inputs, by| observation.with_more_budget::<W>(inputs, by);
                     let of_outcomes = outcomes.budget_sensitivity(played, &more, LARGEST_IN_JOINT);
@@ -173,9 +182,8 @@ impl<'a, W: Arena> GameTraining<'a, W> {
                 let played = &collector.antagonist;
                 let observation = pair.observation;
                 let more = |inputs: &mut Inputs, by| observation.with_more_budget::<W>(inputs, by);
-                let sensitivity = options
-                    .budget_sensitivity
-                    .then(|| antagonist.budget_sensitivity(played, &more, LARGEST));
+                let sensitivity =
+                    charged.then(|| antagonist.budget_sensitivity(played, &more, LARGEST));
                 let signal = sensitivity.as_ref().map_or(Signal::Own, Signal::Charged);
                 let its = &options.antagonist;
                 antagonist.update(played, signal, gamma, its, turn.rates, minibatches)
@@ -187,7 +195,7 @@ impl<'a, W: Arena> GameTraining<'a, W> {
                     price::advantages(
                         &draws.estimates(drawn, gamma, &options.antagonist),
                         &draws.ratios(drawn),
-                        &collector.before_draws,
+                        &collector.before,
                         price::value_at_risk(&collector.weighted, turn.budget),
                     )
                 });
@@ -297,92 +305,4 @@ impl<W: Arena> Training<W> for GameTraining<'_, W> {
     fn players(&self) -> &dyn Players<W> {
         &self.pair
     }
-}
-
-/// One update of one player.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Turn {
-    /// Index, from 1.
-    pub update: u64,
-    /// Whose turn it is.
-    pub role: Role,
-    /// Budget of the rollout.
-    pub budget: Eta,
-    /// How the protagonist picks its actions in the rollout.
-    pub mode: Mode,
-    /// Share of the rollout's episodes that start anywhere.
-    pub exploring: f64,
-    /// Rates of the update.
-    pub rates: Rates,
-}
-
-/// All turns of a run: K of the follower, one of the leader, and so on. While the budget is 1, or the
-/// adversary does not learn, every turn is the protagonist's; at the end those of the response to its greedy policy are the
-/// antagonist's. Each player's rates fall linearly over its own turns.
-pub fn schedule(options: &TrainOptions, eta: Eta) -> Vec<Turn> {
-    let updates = options.updates();
-    let roles: Vec<(Role, Eta)> = roles(options, eta, updates).collect();
-    let count = |wanted: Role| roles.iter().filter(|(role, _)| *role == wanted).count();
-    let totals = [Role::Protagonist, Role::Antagonist].map(count);
-    let mut done = [0usize; 2];
-    let turn = |(update, &(role, budget)): (usize, &(Role, Eta))| {
-        let (player, index): (&PlayerOptions, usize) = match role {
-            Role::Protagonist => (&options.protagonist, 0),
-            Role::Antagonist => (&options.antagonist, 1),
-        };
-        let progress = done[index] as f64 / (totals[index] as f64 - 1.0).max(1.0);
-        done[index] += 1;
-        let between = |first: f64, last: f64| first * (1.0 - progress) + last * progress;
-        let rates = Rates {
-            learning_rate: between(player.learning_rate, player.learning_rate_final),
-            entropy: between(player.entropy, player.entropy_final),
-        };
-        let response = role == Role::Antagonist && is_response(options, update as u64, updates);
-        let mode = if response { Mode::Greedy } else { Mode::Sampled };
-        let exploring = exploring_at(options, update as f64 / updates as f64);
-        Turn { update: update as u64 + 1, role, budget, mode, exploring, rates }
-    };
-    roles.iter().enumerate().map(turn).collect()
-}
-
-/// Whose turn each of so many updates is, and at which budget.
-fn roles(options: &TrainOptions, eta: Eta, updates: u64) -> impl Iterator<Item = (Role, Eta)> + '_ {
-    let round = u64::from(options.follower_updates) + 1;
-    let mut played = 0; // turns at a budget above 1
-    (0..updates).map(move |update| {
-        let budget = budget_at(options, eta, update as f64 / updates as f64);
-        if budget.is_neutral() || options.adversary == Adversary::Random {
-            return (Role::Protagonist, budget);
-        }
-        if is_response(options, update, updates) {
-            return (Role::Antagonist, budget);
-        }
-        played += 1;
-        let leads = played % round == 0;
-        (if leads { options.leader } else { options.leader.other() }, budget)
-    })
-}
-
-/// Whether an update is one of the antagonist's response at the end of the run.
-fn is_response(options: &TrainOptions, update: u64, updates: u64) -> bool {
-    (updates - update) as f64 <= options.response * updates as f64
-}
-
-/// The budget at a point of the run in [0, 1): 1 for `budget_wait`, then rising linearly in log eta
-/// for `budget_rise`, then eta.
-fn budget_at(options: &TrainOptions, eta: Eta, progress: f64) -> Eta {
-    let since = progress - options.budget_wait;
-    if since < 0.0 {
-        Eta::NEUTRAL
-    } else if since < options.budget_rise {
-        Eta::new(eta.get().powf(since / options.budget_rise)).unwrap_or(Eta::NEUTRAL)
-    } else {
-        eta
-    }
-}
-
-/// The share of episodes that start anywhere at a point of the run in [0, 1).
-fn exploring_at(options: &TrainOptions, progress: f64) -> f64 {
-    let left = 1.0 - progress / options.exploring_until;
-    if left > 0.0 { options.exploring_starts * left } else { 0.0 }
 }
