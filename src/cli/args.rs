@@ -8,6 +8,7 @@ use crate::experiment::names::{MethodName, RunId, WorldName};
 use crate::experiment::steps::Format;
 use crate::learn::device::Device;
 use crate::learn::policy::Mode;
+use crate::report::shifts::Shift;
 use clap::{Args, Parser, Subcommand};
 use std::num::NonZeroUsize;
 use std::path::PathBuf;
@@ -50,6 +51,7 @@ pub enum Verb {
     Table(TableArgs),
     Figures(FiguresArgs),
     Report(ReportArgs),
+    Shifts(ShiftsArgs),
     Pack(PackArgs),
     Slurm(SlurmArgs),
     Envs(EnvsArgs),
@@ -185,6 +187,9 @@ pub struct EvaluateArgs {
     /// Seed of the episodes [default: as the run was evaluated].
     #[arg(long, allow_negative_numbers = true, value_parser = whole::<u64>)]
     pub seed: Option<u64>,
+    /// Plays in a world with another constant than in training, such as `env.slip=0.1`. May be repeated.
+    #[arg(long = "set", value_name = "KEY=VALUE")]
+    pub settings: Vec<String>,
     /// Answer as JSON.
     #[arg(long)]
     pub json: bool,
@@ -302,6 +307,28 @@ pub struct ReportArgs {
     /// Output folder of `bench` or `train`.
     #[arg(value_name = "DIR")]
     pub folder: PathBuf,
+}
+
+/// Judge the trained policies of a results folder where the world is another than in training.
+///
+/// Writes DIR/shifts.csv, a line per run and value of a constant, and figures: CVaR at 1/eta against the constant, a line
+/// per method. In finite worlds the numbers are exact. The runs need their weights.
+#[derive(Debug, Args)]
+#[command(after_help = "\
+Examples:
+  cvar-game shifts results/quick
+  cvar-game shifts results/quick --to lava-grid.slip=0.01,0.1,0.3 --to lava-point.noise=1,2")]
+pub struct ShiftsArgs {
+    /// Output folder of `bench` or `train`.
+    #[arg(value_name = "DIR")]
+    pub folder: PathBuf,
+    /// A constant of a world and its values; may be repeated [default: slip on lava-grid; noise, acceleration and
+    /// damping on lava-point].
+    #[arg(long, value_name = "WORLD.CONSTANT=VALUES")]
+    pub to: Vec<Shift>,
+    /// Episodes per run and value where they must be played [default: as the runs were evaluated].
+    #[arg(long, allow_negative_numbers = true, value_parser = kept_episodes)]
+    pub episodes: Option<u64>,
 }
 
 /// Pack the records of a results folder into one archive, DIR/runs.zip.

@@ -3,14 +3,15 @@
 use super::answer::{give, note, print, print_json};
 use super::args::{
     BenchArgs, Cli, CompletionsArgs, EnvsArgs, EvaluateArgs, ExactArgs, FiguresArgs, ManArgs,
-    PackArgs, PrintArgs, RolloutArgs, SlurmArgs, TableArgs, TrainArgs, Verb,
+    PackArgs, PrintArgs, RolloutArgs, ShiftsArgs, SlurmArgs, TableArgs, TrainArgs, Verb,
 };
 use super::progress::{Counter, Meter, Progress, Watched};
 use super::summary;
 use crate::exact::yardstick;
 use crate::experiment::archive;
+use crate::experiment::artefacts::Chance;
 use crate::experiment::config::catalogue::annotated_constants;
-use crate::experiment::config::{Config, RunConfig, Setting, Source};
+use crate::experiment::config::{Config, RunConfig, Setting, Source, WorldConstants};
 use crate::experiment::evaluation;
 use crate::experiment::failure::RunError;
 use crate::experiment::names::{MethodName, RunId, WorldName};
@@ -54,6 +55,7 @@ pub fn run(registry: &Registry, cli: Cli, program: Option<&Path>) -> Result<Exit
         Verb::Table(args) => table(registry, &args),
         Verb::Figures(args) => figures(registry, &args),
         Verb::Report(args) => report(registry, &args.folder),
+        Verb::Shifts(args) => shifts(registry, &args),
         Verb::Pack(args) => pack(&args),
         Verb::Slurm(args) => slurm(registry, &args, &path()?),
         Verb::Envs(args) => envs(registry, &args),
@@ -202,6 +204,9 @@ fn method(method: &MethodName) -> Setting {
 
 fn evaluate(registry: &Registry, args: &EvaluateArgs) -> Result<ExitCode> {
     let run = read_run(registry, &args.folder)?;
+    let settings = args.settings.iter().map(|text| Setting::parse(text));
+    let settings = settings.collect::<Result<Vec<Setting>, _>>()?;
+    let constants = run.constants_with(&settings, registry.catalogue())?;
     let episodes = args.episodes.unwrap_or(run.evaluation.episodes);
     let all = episodes.saturating_mul(evaluation::modes(args.antagonist).len() as u64);
     let meter = Counter::new(Meter::new("episodes", all));
@@ -209,6 +214,7 @@ fn evaluate(registry: &Registry, args: &EvaluateArgs) -> Result<ExitCode> {
         chance: args.antagonist,
         episodes: args.episodes,
         seed: args.seed,
+        constants: Some(&constants),
         progress: &|| meter.count(),
     };
     let plays = registry.world(&run.env)?.evaluate(&run, &args.folder, &request);
@@ -232,6 +238,7 @@ fn rollout(registry: &Registry, args: &RolloutArgs) -> Result<ExitCode> {
         chance: args.antagonist,
         episodes: Some(args.episodes),
         seed: args.seed,
+        constants: None,
         progress: &|| meter.count(),
     };
     let result = registry.world(&run.env)?.rollout(&run, folder, &request, rows, output);
@@ -417,6 +424,34 @@ fn man(args: &ManArgs) -> Result<ExitCode> {
         .and_then(|()| clap_mangen::generate_to(Cli::command(), &args.out));
     written.with_context(|| format!("cannot write to {}", args.out.display()))?;
     print(&format!("manual pages written to {}", args.out.display()))
+}
+
+fn shifts(registry: &Registry, args: &ShiftsArgs) -> Result<ExitCode> {
+    let usual = || report::shifts::USUAL.map(|text| text.parse().expect("it is a shift")).to_vec();
+    let shifts = if args.to.is_empty() { usual() } else { args.to.clone() };
+    let judge = |run: &report::runs::Run, constants: &toml::Table| {
+        let folder = args.folder.join(&run.files.path);
+        let config = read_run(registry, &folder).map_err(|error| error.to_string())?;
+        let world = config.env.world.clone();
+        let constants = WorldConstants { world, table: constants.clone() };
+        let request = Request {
+            chance: Chance::Nominal,
+            episodes: args.episodes,
+            seed: None,
+            constants: Some(&constants),
+            progress: &|| (),
+        };
+        let law =
+            registry.world(&config.env).and_then(|of| of.greedy_law(&config, &folder, &request));
+        law.map_err(|error| error.to_string())
+    };
+    let all = report::shifts::count(&args.folder, &shifts, registry)? as u64;
+    let meter = Counter::new(Meter::new("policies", all));
+    let notes = report::shifts::write(&args.folder, &shifts, registry, &judge, &|| meter.count());
+    meter.finish();
+    notes?.into_iter().for_each(note);
+    note(format!("written to {}", args.folder.join("shifts.csv").display()));
+    Ok(ExitCode::SUCCESS)
 }
 
 fn pack(args: &PackArgs) -> Result<ExitCode> {

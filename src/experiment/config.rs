@@ -280,9 +280,6 @@ impl<'a> Source<'a> {
     }
 }
 
-/// The small benchmark that runs in minutes.
-const QUICK: &str = include_str!("../../configs/quick.toml");
-
 /// The resolved configuration of a sweep.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Config {
@@ -310,7 +307,7 @@ impl Config {
         let mut files = vec![Layer::default_of(catalogue)];
         match source {
             Source::Default => {}
-            Source::Quick => files.push(layers::parse("configs/quick.toml", QUICK)?),
+            Source::Quick => files.push(layers::quick()?),
             Source::File(path) => files.extend(layers::read_files(path)?),
         }
         // At first without `env.KEY`, which needs to know the selected worlds.
@@ -372,7 +369,12 @@ impl Config {
         let settings = match &id.variant {
             None => &self.base,
             Some(name) => {
-                let variant = self.variants.iter().find(|variant| variant.name == *name);
+                let variant = self.variants.iter().find(|variant| {
+                    variant.name == *name
+                        && variant.envs.contains(&id.world)
+                        && variant.methods.contains(&id.method)
+                        && variant.etas.contains(&id.eta)
+                });
                 &variant.expect("the configuration has the variant").settings
             }
         };

@@ -15,7 +15,7 @@ use super::failure::RunError;
 use super::frozen::FrozenOpponent;
 use crate::exact::table::TablePolicy;
 use crate::exact::yardstick::{Evidence, Ratios, Solvable, Yardstick};
-use crate::game::returns::ReturnSoFar;
+use crate::game::returns::{ReturnLaw, ReturnSoFar};
 use crate::learn::method::{Arena, Players};
 use crate::learn::play::{self, Played, Watcher};
 use crate::learn::policy::{Draw, Mode, Nominal, Opponent, Response, Situation, Streams};
@@ -102,6 +102,20 @@ pub fn modes(chance: Chance) -> &'static [Mode] {
 }
 
 impl<W: Arena + Solvable> Contestants<'_, W> {
+    /// The law of the greedy protagonist's return under nominal chance: exact where it can be computed, else of the
+    /// episodes of the run's configuration.
+    ///
+    /// # Errors
+    /// If the world refuses its constants or is too large.
+    pub fn greedy_law(&self) -> Result<ReturnLaw, RunError> {
+        if let (Some(yardstick), Some(policy)) = (self.yardstick()?, self.table()?)
+            && let Some(exact) = yardstick.exact()
+        {
+            return Ok(exact.laws(&policy)?.greedy);
+        }
+        Ok(self.play(Mode::Greedy, Chance::Nominal, &mut ())?.law())
+    }
+
     /// Plays episodes of the run's evaluation, shown to `watcher`.
     ///
     /// # Errors

@@ -127,6 +127,8 @@ pub struct Request<'a> {
     pub episodes: Option<u64>,
     /// Seed of the streams, if not that of the run's configuration.
     pub seed: Option<u64>,
+    /// Constants of the world, if not those of training.
+    pub constants: Option<&'a WorldConstants>,
     /// Called at the end of each episode.
     pub progress: &'a dyn Fn(),
 }
@@ -176,6 +178,18 @@ pub trait Entry: Any + Send + Sync {
         folder: &Path,
         request: &Request<'_>,
     ) -> Result<Vec<Play>, RunError>;
+
+    /// The law of the return of the finished run's greedy protagonist under nominal chance: exact where it can be
+    /// computed.
+    ///
+    /// # Errors
+    /// As [`Entry::evaluate`].
+    fn greedy_law(
+        &self,
+        run: &RunConfig,
+        folder: &Path,
+        request: &Request<'_>,
+    ) -> Result<ReturnLaw, RunError>;
 
     /// Writes every step of episodes of the finished run in `folder`.
     ///
@@ -345,11 +359,25 @@ impl<W: Arena + Solvable> Entry for WorldEntry<W> {
         folder: &Path,
         request: &Request<'_>,
     ) -> Result<Vec<Play>, RunError> {
-        let (run, constants) = (request.apply(run), constants::<W>(&run.env)?);
+        let constants = constants::<W>(request.constants.unwrap_or(&run.env))?;
+        let run = request.apply(run);
         let players = self.load(&run, folder)?;
         let (run, constants, players) = (&run, &constants, &*players);
         let contestants = Contestants { run, constants, players, progress: request.progress };
         evaluation::plays(&contestants, request.chance)
+    }
+
+    fn greedy_law(
+        &self,
+        run: &RunConfig,
+        folder: &Path,
+        request: &Request<'_>,
+    ) -> Result<ReturnLaw, RunError> {
+        let constants = constants::<W>(request.constants.unwrap_or(&run.env))?;
+        let run = request.apply(run);
+        let players = self.load(&run, folder)?;
+        let (run, constants, players) = (&run, &constants, &*players);
+        Contestants { run, constants, players, progress: request.progress }.greedy_law()
     }
 
     fn rollout(

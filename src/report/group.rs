@@ -84,7 +84,8 @@ impl Measures {
     fn of(run: &Run, alphas: &[f64]) -> Measures {
         let laws = Laws::of(run, ReturnLaw::clone);
         let certificate = run.evaluation.as_ref().and_then(|evaluation| evaluation.certificate);
-        let gap = certificate.map(|certificate| certificate.antagonist_gap);
+        // Without an antagonist there is no gap, though files have a 0.
+        let gap = certificate.filter(|_| laws.greedy_game.is_some()).map(|of| of.antagonist_gap);
         let regret = run.regret.known().map(|(regret, _)| regret);
         let cvar = statistics::cvar;
         Measures::new(run, &laws, alphas, regret, gap, cvar)
@@ -99,7 +100,10 @@ impl Measures {
             let noise: f64 = StandardNormal.sample(random);
             number + noise * standard_error
         };
-        let gap = certificate.map(|of| noisy(of.antagonist_gap, of.antagonist_gap_standard_error));
+        let gap = found
+            .antagonist_gap
+            .and(certificate)
+            .map(|of| noisy(of.antagonist_gap, of.antagonist_gap_standard_error));
         let regret = match run.regret {
             // The redrawn episodes have it.
             Regret::Known { best: Some(best), .. } => {

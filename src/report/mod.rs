@@ -8,7 +8,7 @@
 //! | `table.csv`, `table.md`, `table.tex` | statistics over seeds with intervals ([`table`]) | method, world and eta |
 //! | `cross.csv` | greedy CVaR of every policy at every alpha ([`cross`]) | method, world, eta and alpha |
 //!
-//! [`write_all`] adds `figures/` ([`figures`]) and `report.html` ([`page`]), and [`write_comparison`] puts
+//! [`shifts::write`] judges the policies where the world is another than in training. [`write_all`] adds `figures/` ([`figures`]) and `report.html` ([`page`]), and [`write_comparison`] puts
 //! several folders side by side. Methods and variants in one folder are compared in the same way.
 //!
 //! Nothing is simulated, and the only random numbers are those of the bootstrap, whose streams are named:
@@ -24,6 +24,7 @@ pub mod records;
 pub mod render;
 pub mod runs;
 pub mod settings;
+pub mod shifts;
 pub mod statistics;
 pub mod table;
 
@@ -152,6 +153,14 @@ pub enum ReportError {
         dir: PathBuf,
         /// What was found instead.
         notes: Vec<String>,
+    },
+    /// No policy of the folder could be judged in another world.
+    #[error("no policy of {} could be judged there: {what}", .dir.display())]
+    NotJudged {
+        /// The folder.
+        dir: PathBuf,
+        /// Why, for one of them.
+        what: String,
     },
     /// A file or folder could not be read.
     #[error("cannot read {}: {source}; check the path and its permissions", .path.display())]
@@ -299,21 +308,23 @@ pub fn write_figures(dir: &Path, worlds: &dyn Worlds) -> Result<Figures, ReportE
 }
 
 fn persist_figures(dir: &Path, figures: &Figures) -> Result<(), ReportError> {
+    figures.drawn.iter().try_for_each(|figure| persist_figure(dir, figure))
+}
+
+/// Writes a figure into the subfolder `figures`, as SVG and PNG.
+fn persist_figure(dir: &Path, figure: &figures::Figure) -> Result<(), ReportError> {
     let folder = dir.join("figures");
     std::fs::create_dir_all(&folder)
         .map_err(|source| ReportError::Write { path: folder.clone(), source })?;
-    for figure in &figures.drawn {
-        // The name of a world may have a dot.
-        let file = |ending| folder.join(format!("{}.{ending}", figure.name));
-        persist(&file("svg"), figure.picture.svg.as_bytes())?;
-        let path = file("png");
-        let png = figures::png(&figure.picture.svg).map_err(|what| ReportError::Write {
-            path: path.clone(),
-            source: std::io::Error::other(what),
-        })?;
-        persist(&path, &png)?;
-    }
-    Ok(())
+    // The name of a world may have a dot.
+    let file = |ending| folder.join(format!("{}.{ending}", figure.name));
+    persist(&file("svg"), figure.picture.svg.as_bytes())?;
+    let path = file("png");
+    let png = figures::png(&figure.picture.svg).map_err(|what| ReportError::Write {
+        path: path.clone(),
+        source: std::io::Error::other(what),
+    })?;
+    persist(&path, &png)
 }
 
 fn comparison(dir: &Path, others: &[PathBuf], worlds: &dyn Worlds) -> Result<Table, ReportError> {

@@ -45,9 +45,12 @@ impl Layer {
     }
 }
 
+/// The small benchmark that runs in minutes.
+const QUICK: &str = "configs/quick.toml";
+
 /// The configurations of the repository, which the program carries: there they are no files.
 const EMBEDDED: &[(&str, &str)] = &[
-    ("configs/quick.toml", super::QUICK),
+    (QUICK, include_str!("../../../configs/quick.toml")),
     ("configs/paper.toml", include_str!("../../../configs/paper.toml")),
     ("configs/paper-plain.toml", include_str!("../../../configs/paper-plain.toml")),
     ("configs/paper-timeless.toml", include_str!("../../../configs/paper-timeless.toml")),
@@ -55,6 +58,12 @@ const EMBEDDED: &[(&str, &str)] = &[
     ("configs/ablations.toml", include_str!("../../../configs/ablations.toml")),
     ("configs/methods.toml", include_str!("../../../configs/methods.toml")),
 ];
+
+/// The embedded small benchmark.
+pub(super) fn quick() -> Result<Layer, ConfigError> {
+    let (name, text) = EMBEDDED[0];
+    parse(name, text)
+}
 
 /// A TOML file, or the embedded one of that path where there is no such file.
 pub(super) fn read(path: &Path) -> Result<(String, Table), ConfigError> {
@@ -134,6 +143,20 @@ pub struct Setting {
 }
 
 impl Setting {
+    /// The constant of a world that it sets, by `env.KEY` or `env.WORLD.KEY`, and its value.
+    pub(super) fn constant(&self, world: &str) -> Result<(String, Value), ConfigError> {
+        let key: Vec<&str> = self.key.iter().map(String::as_str).collect();
+        match key[..] {
+            ["env", constant] => Ok((constant.to_owned(), self.value.clone())),
+            ["env", of, constant] if of == world => Ok((constant.to_owned(), self.value.clone())),
+            _ => Err(ConfigError::UnknownKey {
+                key: self.key.join("."),
+                origin: self.origin.clone(),
+                advice: format!("set constants of the world here, as env.KEY or env.{world}.KEY"),
+            }),
+        }
+    }
+
     /// Parses the text after `--set`: the value is TOML, and a string if it is not.
     ///
     /// # Errors

@@ -2,7 +2,7 @@
 
 use super::constants::WorldConstants;
 use super::keys::{self, dotted_leaves};
-use super::layers;
+use super::layers::{self, Setting};
 use super::{
     Catalogue, CheckpointOptions, ConfigError, EvaluationOptions, conflicts, of_run, printed,
     rules, typed,
@@ -59,6 +59,23 @@ impl RunConfig {
             eta: self.eta,
             seed: self.seed,
         }
+    }
+
+    /// The constants of its world with some replaced, by settings `env.KEY` or `env.WORLD.KEY`.
+    ///
+    /// # Errors
+    /// If a setting is none of a constant, or the world refuses the constants.
+    pub fn constants_with(
+        &self,
+        settings: &[Setting],
+        catalogue: &Catalogue,
+    ) -> Result<WorldConstants, ConfigError> {
+        let mut changed = self.env.clone();
+        for setting in settings {
+            let (constant, value) = setting.constant(self.env.world.as_str())?;
+            changed.table.insert(constant, value);
+        }
+        changed.checked(catalogue)
     }
 
     /// What determines the training of the run, except its world and method.

@@ -7,7 +7,6 @@ use super::{ConfigError, Experiment, one_line, rules};
 use crate::experiment::names::{MethodName, VariantName, WorldName};
 use crate::game::budget::Eta;
 use serde::Deserialize;
-use std::collections::BTreeSet;
 use toml::{Table, Value};
 
 /// The most variants of an experiment: a typing error should be refused rather than plan years of runs.
@@ -79,8 +78,7 @@ pub(super) fn drafts(
         settings.iter().any(|setting| setting.key() == list)
     };
     let combinations = combinations(&axes);
-    let mut drafts = Vec::new();
-    let mut names = BTreeSet::new();
+    let mut drafts: Vec<Draft> = Vec::new();
     let unnamed = Named::nothing();
     for (own, part) in if named.is_empty() { vec![(unnamed, Part::default())] } else { named } {
         for combination in &combinations {
@@ -88,11 +86,6 @@ pub(super) fn drafts(
             let name: VariantName = part.name.parse().map_err(|error| {
                 ConfigError::Conflict(format!("{error} (a variant of the experiment)"))
             })?;
-            if !names.insert(name.clone()) {
-                return Err(ConfigError::Conflict(format!(
-                    "there are two variants named {name}; give each its own name"
-                )));
-            }
             let draft = Draft {
                 envs: kept(own.envs.as_deref(), &experiment.envs, chosen("envs")),
                 methods: kept(own.methods.as_deref(), &experiment.methods, chosen("methods")),
@@ -100,6 +93,14 @@ pub(super) fn drafts(
                 set: part.settings(&name, schema)?,
                 name,
             };
+            // One name may be of other settings in another world, method or eta.
+            if drafts.iter().any(|of| draft.overlaps(of)) {
+                return Err(ConfigError::Conflict(format!(
+                    "there are two variants named {} for the same runs; give each its own name, or other \
+                     envs, methods or etas",
+                    draft.name
+                )));
+            }
             if !(draft.envs.is_empty() || draft.methods.is_empty() || draft.etas.is_empty()) {
                 drafts.push(draft);
             }
@@ -113,6 +114,19 @@ pub(super) fn drafts(
         ));
     }
     Ok(drafts)
+}
+
+impl Draft {
+    /// Whether both have the same name and a run in common.
+    fn overlaps(&self, other: &Draft) -> bool {
+        fn meet<T: PartialEq>(ours: &[T], theirs: &[T]) -> bool {
+            ours.iter().any(|of| theirs.contains(of))
+        }
+        self.name == other.name
+            && meet(&self.envs, &other.envs)
+            && meet(&self.methods, &other.methods)
+            && meet(&self.etas, &other.etas)
+    }
 }
 
 fn kept<T: Clone + PartialEq>(own: Option<&[T]>, experiment: &[T], chosen: bool) -> Vec<T> {

@@ -77,11 +77,11 @@ pub(super) fn figure(size: (u32, u32), draw: impl FnOnce(&Area) -> Drawn) -> Opt
 }
 
 /// Axes of a chart.
-pub(super) struct Axes {
+pub(super) struct Axes<'a> {
     pub x: std::ops::Range<f64>,
     pub y: std::ops::Range<f64>,
-    pub x_title: &'static str,
-    pub y_title: &'static str,
+    pub x_title: &'a str,
+    pub y_title: &'a str,
 }
 
 /// Whether an axis can hold a number: beyond this there is nothing to be seen, and ticks would be
@@ -109,7 +109,7 @@ pub(super) type Chart<'a, 'b> = ChartContext<
 pub(super) fn chart<'a, 'b>(
     area: &'a Area<'b>,
     title: &str,
-    axes: Axes,
+    axes: Axes<'_>,
 ) -> Result<Chart<'a, 'b>, DrawingAreaErrorKind<std::io::Error>> {
     let mut builder = ChartBuilder::on(area);
     if !title.is_empty() {

@@ -52,25 +52,57 @@ fn of_seeds(panel: &Panel, points: impl Fn(&Records) -> Vec<(f64, f64)>) -> Vec<
     panel.seeds.iter().map(|(_, records)| points(records)).collect()
 }
 
+/// What the seeds of a row have.
+#[derive(Debug, Clone)]
+pub struct Line {
+    /// What it is called.
+    pub title: String,
+    /// Points of each seed, which have the same x.
+    pub seeds: Vec<Vec<(f64, f64)>>,
+}
+
+/// Lines in one chart, each the mean of its seeds in a band of the lowest and the highest one, and a dashed one.
+/// `None` if there is nothing to be drawn.
+pub fn lines(lines: &[Line], dashed: &[(f64, f64)], titles: (&str, &str)) -> Option<Picture> {
+    let names: Vec<String> = lines.iter().map(|line| line.title.clone()).collect();
+    let found: Vec<Vec<Band>> = lines.iter().map(|line| over_seeds(&line.seeds)).collect();
+    named_bands(&names, &found, titles, &[], dashed)
+}
+
 /// Bands in one chart, one for each row.
 fn bands(
     panels: &[Panel],
     bands: &[Vec<Band>],
-    (x_title, y_title): (&'static str, &'static str),
+    titles: (&str, &str),
     dashed: &[Vec<(f64, f64)>],
+) -> Option<Picture> {
+    let names: Vec<String> = panels.iter().map(|panel| panel.group.title()).collect();
+    named_bands(&names, bands, titles, dashed, &[])
+}
+
+/// The same for any rows. A row's dashed line has its colour; `limit` is one of no row.
+fn named_bands(
+    names: &[String],
+    bands: &[Vec<Band>],
+    (x_title, y_title): (&str, &str),
+    dashed: &[Vec<(f64, f64)>],
+    limit: &[(f64, f64)],
 ) -> Option<Picture> {
     if bands.iter().all(Vec::is_empty) {
         return None;
     }
     let all = || bands.iter().flatten();
-    let others = || dashed.iter().flatten();
+    let others = || dashed.iter().flatten().chain(limit);
     let x = span(all().map(|band| band.x).chain(others().map(|(x, _)| *x)))?;
     let ends = all().flat_map(|band| [band.low, band.high]);
     let y = span(ends.chain(others().map(|(_, y)| *y)))?;
-    let words: Vec<_> = (panels.iter().enumerate().zip(bands))
+    let mut words: Vec<_> = (names.iter().enumerate().zip(bands))
         .filter(|(_, band)| !band.is_empty())
-        .map(|((place, panel), _)| (panel.group.title(), colour(place)))
+        .map(|((place, name), _)| (name.clone(), colour(place)))
         .collect();
+    if !limit.is_empty() {
+        words.push(("optimum".to_owned(), INK));
+    }
     let (width, height) = (1380, 714);
     let legend = Legend::new(words, width);
     figure((width, legend.height + height), |canvas| {
@@ -91,6 +123,8 @@ fn bands(
             let style = colour(place).stroke_width(4);
             chart.draw_series(DashedLineSeries::new(line.iter().copied(), 10, 8, style))?;
         }
+        let (line, style) = (limit.iter().copied(), INK.stroke_width(4));
+        chart.draw_series(DashedLineSeries::new(line, 10, 8, style))?;
         Ok(())
     })
 }

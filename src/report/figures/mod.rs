@@ -15,6 +15,7 @@ mod curves;
 mod maps;
 
 pub use canvas::{Picture, png, rgb};
+pub use curves::{Line, lines};
 pub use maps::moment;
 
 use super::Worlds;
