@@ -59,7 +59,7 @@ fn every_method_trains_there_and_enters_the_table() {
         let evaluation = read_evaluation(&folder).unwrap().unwrap();
         // An antagonist plays where the method has one, and the budget allows it something.
         assert_eq!(evaluation.audit.is_some(), id.method == "game" && id.eta.get() > 1.0);
-        assert_eq!(evaluation.certificate.is_some(), id.method == "game");
+        assert!(evaluation.certificate.is_some());
         means.push(evaluation.play(Mode::Greedy, Chance::Nominal).unwrap().law.mean());
     }
     // Runs by method, then eta. At eta = 1 the pair has learned; the uniform policy never does.

@@ -473,7 +473,8 @@ impl Render for Csv {
 }
 
 /// JSON: `{schema, columns: {KEY: {title, meaning}}, worlds: [{env, episodes, checks, rows: [{folder,
-/// method, variant, settings, eta, alpha, seeds, failures, KEY: ..}]}], notes}`. An estimate is `{value, low,
+/// method, variant, settings, reference, eta, alpha, seeds, failures, KEY: ..}]}], notes}`. A reference is a policy that no
+/// method trained. An estimate is `{value, low,
 /// high}`, the worst seed `{value, seed}`, a count a number; `null` where there is no number, no variant or no
 /// other settings.
 pub struct Json;
@@ -498,6 +499,7 @@ impl Json {
                 "method": row.method,
                 "variant": row.variant,
                 "settings": row.settings,
+                "reference": row.reference,
                 "eta": row.eta,
                 "alpha": 1.0 / row.eta,
                 "seeds": row.seeds,

@@ -814,13 +814,15 @@ fn world(name: &str, results: &[Results]) -> World {
             let shown = [Block::Returns, Block::Cross].iter().any(|of| column.blocks.contains(of));
             if shown { (column.compute)(group, &nobody) } else { Cell::Missing }
         };
+        let settings = told_apart(&tasks, task);
+        let method = run.name.method.clone();
         rows.push(Row {
             eta: group.eta,
             folder: String::new(),
-            method: run.name.method.clone(),
+            name: settings.as_ref().map_or(method.clone(), |of| format!("{method}, {of}")),
+            method,
             variant: None,
-            name: run.name.method.clone(),
-            settings: None,
+            settings,
             reference: true,
             task,
             seeds: 0,
@@ -834,6 +836,14 @@ fn world(name: &str, results: &[Results]) -> World {
     mark(&mut rows);
     let first = first.map_or(results[0].name.clone(), |first| first.name.clone());
     World { name: name.to_owned(), first, rows, episodes: episodes(&all), checks: checks(&all) }
+}
+
+/// What tells a task apart from others of its world, such as `slip=0.3`; `None` if there are no others.
+fn told_apart(tasks: &[&Task], place: usize) -> Option<String> {
+    let other = tasks.get(usize::from(place == 0))?;
+    let differences = tasks[place].differences(other);
+    let words = differences.iter().map(|of| format!("{}={}", of.key, of.values[0]));
+    Some(words.collect::<Vec<String>>().join(", "))
 }
 
 /// What a reader must know before comparing the rows of a world: other tasks, other training (of other
