@@ -107,10 +107,10 @@ pub fn write(
     Ok(notes)
 }
 
-/// Number of judgements that [`write`] makes.
+/// Number of judgements that [`write()`] makes.
 ///
 /// # Errors
-/// As [`write`].
+/// As [`write()`].
 pub fn count(dir: &Path, shifts: &[Shift], worlds: &dyn Worlds) -> Result<usize, ReportError> {
     Ok(work(&Runs::read(dir, worlds)?, shifts).count())
 }
