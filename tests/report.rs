@@ -3,7 +3,7 @@
 use cvar_game::exact::yardstick::Exploitability;
 use cvar_game::experiment::archive;
 use cvar_game::experiment::artefacts::{
-    Audit, Certificate, Chance, Evaluation, Manifest, Play, SCHEMA,
+    Audit, Certificate, Chance, Close, Evaluation, Manifest, Play, SCHEMA,
 };
 use cvar_game::experiment::registry::standard;
 use cvar_game::game::returns::{Atom, ReturnLaw};
@@ -81,6 +81,7 @@ fn manifest(dir: &Path, env: &str, eta: f64, seed: u64, failure: Option<&str>) {
         cores: Some(2),
         seconds: 3.0,
         steps: 250_000,
+        close: (seed != 2).then_some(Close { steps: 10_000 * seed, seconds: 0.5 }),
         notes: Vec::new(),
         evaluation_seconds: None,
         failure: failure.map(str::to_owned),

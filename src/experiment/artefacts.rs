@@ -56,6 +56,10 @@ pub struct Manifest {
     pub evaluation_seconds: Option<f64>,
     /// Environment steps of training.
     pub steps: u64,
+    /// When the regret of the greedy protagonist was first measured to be at most 0.05; `None` if it never was, or
+    /// cannot be measured in training.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub close: Option<Close>,
     /// What was not done as it was asked for, such as a number of steps that was rounded up.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub notes: Vec<String>,
@@ -78,10 +82,20 @@ impl Manifest {
             seconds,
             evaluation_seconds: None,
             steps,
+            close: None,
             notes: Vec::new(),
             failure: None,
         }
     }
+}
+
+/// When a run came close to the optimum.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct Close {
+    /// Environment steps.
+    pub steps: u64,
+    /// Wall-clock seconds of training.
+    pub seconds: f64,
 }
 
 /// Model name of the processor, where the system provides it.

@@ -14,7 +14,7 @@ use super::config::RunConfig;
 use super::failure::RunError;
 use super::frozen::FrozenOpponent;
 use crate::exact::table::TablePolicy;
-use crate::exact::yardstick::{Evidence, Ratios, Solvable, Yardstick};
+use crate::exact::yardstick::{self, Evidence, Ratios, Solvable, Yardstick};
 use crate::game::returns::{ReturnLaw, ReturnSoFar};
 use crate::learn::method::{Arena, Players};
 use crate::learn::play::{self, Played, Watcher};
@@ -310,11 +310,27 @@ impl<W: World> Opponent<W> for WorstCase<'_> {
     }
 }
 
-/// Measures the regret of the greedy protagonist during training; `None` where that needs played
-/// episodes.
-pub type RegretMeter<W> = Box<dyn Fn(&dyn Players<W>) -> Result<Option<f64>, RunError>>;
+/// Measures the regret of the greedy protagonist during training.
+pub struct RegretMeter<W: World> {
+    /// How often it is asked in a run.
+    pub points: u64,
+    /// The regret of the protagonist; `None` where its policy does not say enough.
+    pub measure: Box<Measure<W>>,
+}
 
-/// The meter of the regret in training, where the regret can be computed without playing.
+/// See [`RegretMeter::measure`].
+pub type Measure<W> = dyn Fn(&dyn Players<W>) -> Result<Option<f64>, RunError>;
+
+/// Points of the curve of the regret in training, where it is exact.
+const EXACT_POINTS: u64 = 40;
+
+/// The same where episodes must be played for each.
+const PLAYED_POINTS: u64 = 20;
+
+/// The least number of these episodes, and how many of them the tail holds at least.
+const PLAYED_EPISODES: (u64, f64) = (2_000, 50.0);
+
+/// The meter of the regret in training; `None` where no optimum is known without minutes of computation.
 ///
 /// # Errors
 /// If the world refuses its constants or is too large.
@@ -322,17 +338,36 @@ pub fn regret_meter<W: Arena + Solvable>(
     constants: &W::Constants,
     run: &RunConfig,
 ) -> Result<Option<RegretMeter<W>>, RunError> {
-    let yardstick = W::yardstick(constants, run.gamma, &run.evaluation.yardstick())?;
-    let Some(yardstick) = yardstick.filter(|yardstick| yardstick.exact().is_some()) else {
-        return Ok(None);
-    };
-    let (constants, eta) = (constants.clone(), run.eta.get());
-    Ok(Some(Box::new(move |players| {
-        let (Some(exact), Some(policy)) = (yardstick.exact(), table(&constants, players)?) else {
-            return Ok(None);
+    let options =
+        yardstick::Options { source: yardstick::Source::Shipped, ..run.evaluation.yardstick() };
+    let Some(yardstick) = W::yardstick(constants, run.gamma, &options)? else { return Ok(None) };
+    let (constants, eta, gamma) = (constants.clone(), run.eta, run.gamma);
+    if yardstick.exact().is_some() {
+        let measure = move |players: &dyn Players<W>| {
+            let (Some(exact), Some(policy)) = (yardstick.exact(), table(&constants, players)?)
+            else {
+                return Ok(None);
+            };
+            Ok(Some(exact.regret(eta.get(), &policy)?))
         };
-        Ok(Some(exact.regret(eta, &policy)?))
-    })))
+        return Ok(Some(RegretMeter { points: EXACT_POINTS, measure: Box::new(measure) }));
+    }
+    if yardstick.optimal_law(eta.get())?.is_none() {
+        return Ok(None);
+    }
+    let (least, tail) = PLAYED_EPISODES;
+    let episodes =
+        ((tail * eta.get()).ceil() as u64).clamp(least, run.evaluation.episodes.max(least));
+    let slots = run.evaluation.parallel_episodes.min(episodes as usize);
+    let (mode, draw, seed) = (Mode::Greedy, Draw::Nominal, run.evaluation.seed);
+    let setting = play::Play { mode, draw, eta, gamma, episodes, seed };
+    let measure = move |players: &dyn Players<W>| {
+        let (world, mut protagonist) = (W::new(&constants, slots)?, players.protagonist());
+        let law = play::play(world, protagonist.as_mut(), &mut Nominal, &setting, &mut ()).law();
+        let evidence = Evidence { nominal: Some(&law), ..Evidence::default() };
+        Ok(yardstick.compare(eta.get(), &evidence)?.map(|found| found.regret))
+    };
+    Ok(Some(RegretMeter { points: PLAYED_POINTS, measure: Box::new(measure) }))
 }
 
 /// The budget audit: `[greedy, sampled]` episodes under the antagonist and the sampled protagonist's

@@ -1,5 +1,6 @@
 //! `progress.csv` and TensorBoard's event file: what training reports, update by update.
 
+use super::artefacts::Close;
 use super::growing_file::{Extent, GrowingFile};
 use super::tensorboard::{self, EventFile};
 use crate::learn::method::{Metric, Progress};
@@ -106,7 +107,45 @@ impl ProgressFile {
     }
 }
 
+/// The first update of a run after which the regret was measured to be at most `regret`.
+pub fn first_close(folder: &Path, regret: f64) -> Option<Close> {
+    let mut reader = csv::Reader::from_path(folder.join(ProgressFile::NAME)).ok()?;
+    let header = reader.headers().ok()?.clone();
+    let place = |name: &str| header.iter().position(|column| column == name);
+    let (steps, measured, seconds) = (place("steps")?, place(TAIL[0].column)?, place(SECONDS)?);
+    let found = reader
+        .records()
+        .map_while(Result::ok)
+        .find(|record| record[measured].parse().is_ok_and(|value: f64| value <= regret))?;
+    Some(Close { steps: found[steps].parse().ok()?, seconds: found[seconds].parse().ok()? })
+}
+
 /// Seconds since 1970.
 fn now() -> f64 {
     SystemTime::now().duration_since(UNIX_EPOCH).map_or(0.0, |time| time.as_secs_f64())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_first_close_update_is_found() {
+        let dir = tempfile::tempdir().unwrap();
+        let mut file = ProgressFile::create(dir.path(), &[]).unwrap();
+        for (update, regret) in [(1, None), (2, Some(0.3)), (3, Some(0.04)), (4, Some(0.01))] {
+            let of = Progress {
+                update,
+                steps: 100 * update,
+                player: "protagonist",
+                mean_return: 0.0,
+                values: Vec::new(),
+            };
+            file.add(&of, update as f64, regret).unwrap();
+        }
+        file.extent().unwrap();
+        let first = |regret| first_close(dir.path(), regret).map(|of| (of.steps, of.seconds));
+        assert_eq!(first(0.05), Some((300, 3.0)));
+        assert_eq!(first(0.005), None);
+    }
 }

@@ -11,7 +11,7 @@ use super::evaluation::{self, Contestants};
 use super::failure::RunError;
 use super::figure_data;
 use super::lock::RunLock;
-use super::progress_file::ProgressFile;
+use super::progress_file::{self, ProgressFile};
 use super::runner::{Evaluated, Report, Tick, WEIGHTS, evaluation_in};
 use super::stop::Stop;
 use crate::exact::yardstick::Solvable;
@@ -21,10 +21,10 @@ use std::cell::{Cell, RefCell};
 use std::fs;
 use std::io;
 use std::path::Path;
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
-/// Points of the curve of the regret in training.
-const REGRET_POINTS: u64 = 40;
+/// A protagonist whose regret is at most this is close to the optimum.
+const CLOSE: f64 = 0.05;
 
 /// Carries out the run and writes its artefacts to `folder`, `evaluation.json` last. Continues from an
 /// earlier attempt of the same run in it.
@@ -62,6 +62,7 @@ pub fn execute<W: Arena + Solvable>(
     }
     let (steps, seconds) = (attempt.training.steps(), attempt.seconds());
     let mut manifest = Manifest::of(&run.id(), &run.device.to_string(), steps, seconds);
+    manifest.close = progress_file::first_close(folder, CLOSE);
     manifest.notes.extend(run.train.rounding());
     manifest.failure = trained.as_ref().err().map(ToString::to_string);
     write_json(&folder.join("manifest.json"), &manifest)?;
@@ -164,6 +165,8 @@ struct Attempt<'a, W: Arena> {
     /// Seconds of training before this attempt.
     before: f64,
     start: Instant,
+    /// Of this attempt, in which the regret was measured.
+    measuring: Duration,
 }
 
 impl<'a, W: Arena + Solvable> Attempt<'a, W> {
@@ -208,6 +211,7 @@ impl<'a, W: Arena + Solvable> Attempt<'a, W> {
                                 meter,
                                 before,
                                 start,
+                                measuring: Duration::ZERO,
                             });
                         }
                         Err(error) => pass_over(&path, &format!("does not fit: {error}"), report)?,
@@ -219,12 +223,13 @@ impl<'a, W: Arena + Solvable> Attempt<'a, W> {
         let path = folder.join(ProgressFile::NAME);
         let progress =
             ProgressFile::create(folder, method.metrics).map_err(RunError::file(&path))?;
-        Ok(Attempt { run, folder, training: fresh()?, progress, meter, before: 0.0, start })
+        let (training, before, measuring) = (fresh()?, 0.0, Duration::ZERO);
+        Ok(Attempt { run, folder, training, progress, meter, before, start, measuring })
     }
 
     /// Seconds of training so far.
     fn seconds(&self) -> f64 {
-        self.before + self.start.elapsed().as_secs_f64()
+        self.before + (self.start.elapsed() - self.measuring).as_secs_f64()
     }
 
     fn train(&mut self, stop: &Stop, report: &mut dyn FnMut(Report)) -> Result<(), RunError> {
@@ -252,11 +257,17 @@ impl<'a, W: Arena + Solvable> Attempt<'a, W> {
 
     /// The regret after an update that went from `before` to `after` steps, if it is one at which it
     /// is measured.
-    fn regret(&self, before: u64, after: u64) -> Result<Option<f64>, RunError> {
+    fn regret(&mut self, before: u64, after: u64) -> Result<Option<f64>, RunError> {
         let Some(meter) = &self.meter else { return Ok(None) };
         let all = self.run.train.steps;
-        let points = |steps: u64| steps.min(all) * REGRET_POINTS / all;
-        if points(after) > points(before) { meter(self.training.players()) } else { Ok(None) }
+        let points = |steps: u64| steps.min(all) * meter.points / all;
+        if points(after) == points(before) {
+            return Ok(None);
+        }
+        let begun = Instant::now();
+        let regret = (meter.measure)(self.training.players());
+        self.measuring += begun.elapsed();
+        regret
     }
 
     fn save(&mut self) -> Result<(), RunError> {

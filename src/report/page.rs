@@ -65,7 +65,7 @@ fn summary(table: &Table) -> Markup {
     html! {
         @for note in &table.notes { p.note { (note) } }
         p { "A protagonist learns to reach a goal past lava while an antagonist reweights chance within a budget eta. "
-            "It should maximise CVaR at alpha = 1/eta: the mean of its worst returns." }
+            "If it is deterministic and both play their best, it maximises CVaR at alpha = 1/eta: the mean of its worst returns." }
         @for world in &table.worlds {
             h3 { (world.name) }
             ul { @for row in &world.rows { @if !row.reference { li { (sentence(table, row)) } } } }

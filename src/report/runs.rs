@@ -40,6 +40,7 @@
 //! | `status` | `finished` or `failed` |
 //! | `steps`, `seconds` | environment steps and wall-clock seconds of training |
 //! | `evaluation_seconds` | wall-clock seconds of the evaluation and of the figures' data; left out where no run has them |
+//! | `steps_to_close`, `seconds_to_close` | environment steps and seconds of training when the regret was first measured to be at most 0.05; left out where no run has them |
 //! | `greedy_mean`, `greedy_cvar` | mean and CVaR_alpha of the return J, greedy protagonist, nominal chance |
 //! | `greedy_lava`, `greedy_goal`, `greedy_timeout` | shares of its episodes that end so |
 //! | `greedy_cvar_0.04`, `greedy_cvar_0.01` | its CVaR at alpha = 0.04 and 0.01 |
@@ -63,7 +64,7 @@ use super::{Optimum, ReportError, Worlds, statistics};
 use crate::exact::yardstick::Exploitability;
 use crate::experiment::archive::{FIRST_METHOD, RunFiles, RunName, Store};
 use crate::experiment::artefacts::{
-    Audit, Certificate, Chance, Evaluation, Manifest, Play, SCHEMA,
+    Audit, Certificate, Chance, Close, Evaluation, Manifest, Play, SCHEMA,
 };
 use crate::experiment::registry::Limits;
 use crate::game::returns::{Atom, ReturnLaw};
@@ -156,6 +157,11 @@ impl Run {
         self.plays(Mode::Greedy, Chance::Nominal).find_map(|play| play.mean_clearance)
     }
 
+    /// When it came close to the optimum.
+    pub fn close(&self) -> Option<Close> {
+        self.manifest.as_ref()?.close
+    }
+
     /// Wall-clock seconds of the evaluation and of the figures' data.
     pub fn evaluation_seconds(&self) -> Option<f64> {
         self.manifest.as_ref()?.evaluation_seconds
@@ -246,13 +252,14 @@ const SETTINGS_COLUMN: Column =
     ("settings", |of| Field::Text(of.run.label.clone().unwrap_or_default()));
 
 /// Groups of columns that runs of former versions do not fill; one is left out where no run fills any of it.
-const LATER_COLUMNS: [&[&str]; 2] = [
+const LATER_COLUMNS: [&[&str]; 3] = [
     &["evaluation_seconds"],
+    &["steps_to_close", "seconds_to_close"],
     &["class_regret", "response_gain", "response_error", "exploitability"],
 ];
 
 /// The other columns, in order.
-const COLUMNS: [Column; 36] = [
+const COLUMNS: [Column; 38] = [
     ("env", |of| Field::Text(of.run.name.world.clone())),
     ("eta", |of| Field::Text(of.run.name.eta.to_string())),
     ("seed", |of| Field::Count(Some(of.run.name.seed))),
@@ -262,6 +269,8 @@ const COLUMNS: [Column; 36] = [
     ("steps", |of| Field::Count(Some(of.run.steps))),
     ("seconds", |of| Field::Number(Some(of.run.seconds))),
     ("evaluation_seconds", |of| Field::Number(of.run.evaluation_seconds())),
+    ("steps_to_close", |of| Field::Count(of.run.close().map(|of| of.steps))),
+    ("seconds_to_close", |of| Field::Number(of.run.close().map(|of| of.seconds))),
     ("greedy_mean", |of| mean(of.greedy)),
     ("greedy_cvar", |of| Field::Number(of.own_cvar(of.greedy))),
     ("greedy_lava", |of| share(of.greedy, End::Lava)),

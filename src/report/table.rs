@@ -14,7 +14,7 @@ use super::runs::{AT_NEUTRAL, Regret, Run, Runs};
 use super::settings::{Settings, Task, listed};
 use super::statistics::{self, Estimate, Interval};
 use crate::experiment::archive::FIRST_METHOD;
-use crate::experiment::artefacts::{Audit, Chance};
+use crate::experiment::artefacts::{Audit, Chance, Close};
 use crate::experiment::words::{counted, thousands};
 use crate::game::returns::ReturnLaw;
 use crate::learn::policy::Mode;
@@ -177,6 +177,14 @@ fn cost(group: &Group, of: impl Fn(&Run) -> Option<f64>) -> Cell {
     estimate(statistics::mean(&values).map(|value| Estimate { value, interval: None }))
 }
 
+/// Median over the runs of when they came close to the optimum; none if more than half of them did not.
+fn median(group: &Group, of: impl Fn(Close) -> f64) -> Cell {
+    let values: Vec<f64> =
+        group.runs.iter().map(|run| run.close().map_or(f64::INFINITY, &of)).collect();
+    let value = statistics::median(&values).filter(|value| value.is_finite());
+    estimate(value.map(|value| Estimate { value, interval: None }))
+}
+
 /// CVaR at a fixed level; levels of [`super::group::ALPHAS`] are always measured.
 fn cvar(group: &Group, alpha: f64) -> Cell {
     let level = group.level(alpha);
@@ -191,10 +199,17 @@ fn violations(group: &Group) -> Option<u64> {
 
 /// Columns that results of former versions have no numbers for. CSV files leave them out where no row has
 /// one, so that those of such results stay as they are.
-const LATER: [&str; 4] = ["class_regret", "exploitability", "response_gain", "evaluation_seconds"];
+const LATER: [&str; 6] = [
+    "class_regret",
+    "exploitability",
+    "response_gain",
+    "evaluation_seconds",
+    "steps_to_close",
+    "seconds_to_close",
+];
 
 /// The columns, in order. World, eta, alpha, seeds and failures stand before them in every format.
-pub static COLUMNS: [Column; 37] = [
+pub static COLUMNS: [Column; 39] = [
     Column {
         key: "mean",
         title: "mean",
@@ -572,6 +587,27 @@ pub static COLUMNS: [Column; 37] = [
         meaning: "wall-clock seconds of the evaluation and of the figures' data, mean over seeds",
         brief: "",
         compute: |group, _| cost(group, Run::evaluation_seconds),
+    },
+    Column {
+        key: "steps_to_close",
+        title: "steps to 0.05",
+        blocks: &[Block::Cost],
+        format: Format::Estimate(0),
+        best: Best::None,
+        meaning: "environment steps when the regret was first measured to be at most 0.05, median over seeds; none if \
+                  more than half of them never came so close",
+        brief: "when the regret was first at most 0.05",
+        compute: |group, _| median(group, |close| close.steps as f64),
+    },
+    Column {
+        key: "seconds_to_close",
+        title: "seconds to 0.05",
+        blocks: &[Block::Cost],
+        format: Format::Estimate(1),
+        best: Best::None,
+        meaning: "the same in wall-clock seconds of training",
+        brief: "",
+        compute: |group, _| median(group, |close| close.seconds),
     },
     Column {
         key: "steps_per_second",

@@ -156,9 +156,9 @@ pub(super) fn regret(panels: &[Panel]) -> Option<(Picture, String)> {
     let found: Vec<Vec<Band>> =
         panels.iter().map(|panel| over_seeds(&of_seeds(panel, points))).collect();
     let svg = bands(panels, &found, ("environment steps", "regret"), &[])?;
-    let caption = "V*(eta) minus the exact CVaR_1/eta of the greedy protagonist as it is after so many \
-                   steps (at eta = 1 the best mean minus its mean). Line: mean over seeds; band: lowest \
-                   and highest seed.";
+    let caption = "The best CVaR_1/eta that is known minus that of the greedy protagonist as it is after so many \
+                   steps (at eta = 1 the best mean minus its mean): exact in finite worlds, else of a few thousand \
+                   episodes. Line: mean over seeds; band: lowest and highest seed.";
     Some((svg, caption.to_owned()))
 }
 
