@@ -323,7 +323,7 @@ pub struct ShiftsArgs {
     #[arg(value_name = "DIR")]
     pub folder: PathBuf,
     /// A constant of a world and its values; may be repeated [default: slip on lava-grid; noise, acceleration and
-    /// damping on lava-point].
+    /// what damping leaves of the velocity on lava-point].
     #[arg(long, value_name = "WORLD.CONSTANT=VALUES")]
     pub to: Vec<Shift>,
     /// Episodes per run and value where they must be played [default: as the runs were evaluated].

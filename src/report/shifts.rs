@@ -25,7 +25,7 @@ pub const USUAL: [&str; 4] = [
     "lava-grid.slip=0.01,0.02,0.05,0.1,0.15,0.2",
     "lava-point.noise=0.5,1,1.5,2,2.5",
     "lava-point.acceleration=1.5,2,2.5,3,3.5",
-    "lava-point.damping=0.3,0.4,0.5,0.6,0.7",
+    "lava-point.velocity_retention=0.3,0.4,0.5,0.6,0.7",
 ];
 
 impl FromStr for Shift {
@@ -189,6 +189,10 @@ fn drawn(judged: &[Judged<'_>]) -> Vec<Figure> {
             here.iter().filter_map(|of| Some((of.value, of.optimum?))).collect();
         optima.sort_by(|a, b| a.0.total_cmp(&b.0));
         optima.dedup();
+        // One value is no line.
+        if optima.len() < 2 {
+            optima.clear();
+        }
         let trained = here[0].run.settings.task.constants.get(&constant);
         let trained = trained
             .map_or(String::new(), |value| format!(" All were trained with {constant} = {value}."));
