@@ -8,10 +8,11 @@
 //! | `table.csv`, `table.md`, `table.tex` | statistics over seeds with intervals ([`table`]) | method, world and eta |
 //! | `cross.csv` | greedy CVaR of every policy at every alpha ([`cross`]) | method, world, eta and alpha |
 //!
-//! [`shifts::write`] judges the policies where the world is another than in training. [`write_all`] adds `figures/` ([`figures`]) and `report.html` ([`page`]), and [`write_comparison`] puts
+//! [`write_all`] adds `figures/` ([`figures`]) and `report.html` ([`page`]), and [`write_comparison`] puts
 //! several folders side by side. Methods and variants in one folder are compared in the same way.
+//! [`shifts::write`] judges the policies where the world is another than in training.
 //!
-//! Nothing is simulated, and the only random numbers are those of the bootstrap, whose streams are named:
+//! Nothing is simulated here ([`shifts`] has its caller play), and the only random numbers are those of the bootstrap, whose streams are named:
 //! the same artefacts give the same bytes. What a world looks like, and its exact optima, are asked from
 //! [`Worlds`].
 

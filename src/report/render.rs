@@ -473,8 +473,8 @@ impl Render for Csv {
 }
 
 /// JSON: `{schema, columns: {KEY: {title, meaning}}, worlds: [{env, episodes, checks, rows: [{folder,
-/// method, variant, settings, reference, eta, alpha, seeds, failures, KEY: ..}]}], notes}`. A reference is a policy that no
-/// method trained. An estimate is `{value, low,
+/// method, variant, settings, reference, eta, alpha, seeds, failures, KEY: ..}]}], notes}`. A reference is a policy that
+/// no method trained. An estimate is `{value, low,
 /// high}`, the worst seed `{value, seed}`, a count a number; `null` where there is no number, no variant or no
 /// other settings.
 pub struct Json;

@@ -3,7 +3,7 @@
 
 use super::figures::{self, Figure, Line};
 use super::runs::{Run, Runs, csv_text, number};
-use super::{Optimum, ReportError, Worlds, persist, persist_figure};
+use super::{Optimum, ReportError, Worlds, persist, persist_figure, statistics};
 use crate::game::returns::ReturnLaw;
 use lava_envs::End;
 use std::path::Path;
@@ -54,13 +54,14 @@ struct Judged<'a> {
 }
 
 impl Judged<'_> {
-    fn cvar(&self) -> f64 {
-        self.law.cvar(self.run.alpha())
+    /// CVaR_{1/eta}; `None` if its tail holds too few episodes.
+    fn cvar(&self) -> Option<f64> {
+        statistics::cvar(&self.law, self.run.alpha())
     }
 }
 
 /// The law of the return of a run's greedy protagonist under these constants, or why there is none.
-pub type Judge<'a> = dyn Fn(&Run, &toml::Table) -> Result<ReturnLaw, String> + Sync + 'a;
+pub type Judge<'a> = dyn Fn(&Run, &toml::Table) -> Result<ReturnLaw, String> + 'a;
 
 /// Judges every run of a folder under every shift of its world; writes `shifts.csv` and the figures, and answers with
 /// what a reader must know. `judged` is called after each run and value.
@@ -125,7 +126,7 @@ fn work<'a>(
     })
 }
 
-/// A line per run and value. `optimum` is the best CVaR_{1/eta} under that value, exact in finite worlds.
+/// A line per run and value; `cvar` is empty where its tail holds fewer than ten episodes. `optimum` is the best CVaR_{1/eta} under that value, exact in finite worlds.
 fn to_csv(judged: &[Judged<'_>]) -> String {
     let header = [
         "env", "method", "variant", "eta", "seed", "constant", "value", "mean", "cvar", "goal",
@@ -143,7 +144,7 @@ fn to_csv(judged: &[Judged<'_>]) -> String {
             of.constant.to_owned(),
             of.value.to_string(),
             number(Some(law.mean())),
-            number(Some(of.cvar())),
+            number(of.cvar()),
             number(Some(law.probability(End::Goal))),
             number(Some(law.probability(End::Lava))),
             law.episodes().map_or("exact".to_owned(), |episodes| episodes.to_string()),
@@ -175,7 +176,8 @@ fn drawn(judged: &[Judged<'_>]) -> Vec<Figure> {
         let line = |title: &String| {
             let mut seeds: Vec<(u64, Vec<(f64, f64)>)> = Vec::new();
             for of in here.iter().filter(|of| name(of) == *title) {
-                let (seed, point) = (of.run.name.seed, (of.value, of.cvar()));
+                let Some(cvar) = of.cvar() else { continue };
+                let (seed, point) = (of.run.name.seed, (of.value, cvar));
                 match seeds.iter_mut().find(|(known, _)| *known == seed) {
                     Some((_, points)) => points.push(point),
                     None => seeds.push((seed, vec![point])),

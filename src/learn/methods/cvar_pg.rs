@@ -6,7 +6,7 @@
 //! ```
 //!
 //! Only the worst alpha of a rollout's episodes carry gradient. Without a schedule of the risk level
-//! (`train.budget_wait`, `train.budget_rise`) it does not see success before failures are rarer than alpha, its known
+//! (`train.budget_wait`, `train.budget_rise`) it may not see success before failures are rarer than alpha, its known
 //! blindness (Greenberg and others, NeurIPS 2022); with one it is their soft risk. At level 1, where the tail is all
 //! episodes and any baseline is right, it is PPO.
 //!

@@ -737,11 +737,17 @@ def _table_rows(inner: Any) -> tuple[list[tuple[float, float, float, float, floa
     if getattr(inner, "fickle_passenger", False):
         raise ValueError("the environment's table P leaves out the fickle passenger; make it without one")
     rows: list[tuple[float, float, float, float, float]] = []
+    pairs = 0
     for state in range(len(table)):
         try:
             actions = table[state]
+            pairs += 1 + len(actions)
+            if pairs > LARGEST:
+                break
             for action in range(len(actions)):
                 for probability, next_state, reward, terminated in actions[action]:
+                    if len(rows) == LARGEST:
+                        break
                     next_state = -1 if terminated else int(next_state)
                     row = (state, action, next_state, float(probability), float(reward))
                     rows.append(row)
@@ -750,6 +756,8 @@ def _table_rows(inner: Any) -> tuple[list[tuple[float, float, float, float, floa
                 f"env.unwrapped.P[{state}] must be {{action: [(probability, next, reward, terminated)]}}, "
                 "with states and actions numbered from 0"
             ) from None
+    if max(pairs, len(rows)) >= LARGEST:
+        raise ValueError(f"env.unwrapped.P must have fewer than {LARGEST} actions and transitions")
     return rows, len(table)
 
 
