@@ -30,7 +30,7 @@ use numpy::{
     IntoPyArray, PyArray1, PyArray2, PyArrayMethods, PyReadonlyArray2, PyReadonlyArrayDyn,
     PyUntypedArrayMethods,
 };
-use pyo3::exceptions::PyValueError;
+use pyo3::exceptions::{PyOverflowError, PyValueError};
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
 use std::ffi::OsString;
@@ -56,7 +56,15 @@ fn invalid(message: impl Into<String>) -> PyErr {
     PyValueError::new_err(message.split_whitespace().collect::<Vec<_>>().join(" "))
 }
 
-/// The same for a result.
+/// A whole number; one that is too large for any use is bad input as others are.
+fn index(value: &Bound<'_, PyAny>) -> PyResult<i64> {
+    value.extract().map_err(|error: PyErr| {
+        let overflows = error.is_instance_of::<PyOverflowError>(value.py());
+        if overflows { invalid("a whole number is out of range") } else { error }
+    })
+}
+
+/// A result, whose error is bad input.
 fn valid<T>(result: Result<T, String>) -> PyResult<T> {
     result.map_err(invalid)
 }

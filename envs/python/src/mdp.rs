@@ -10,7 +10,7 @@
 //!   returns of the solver are J + c.
 
 use crate::law::Law;
-use crate::{budget, discount, invalid, valid};
+use crate::{budget, discount, index, invalid, valid};
 use cvar_game::exact::ExactError;
 use cvar_game::exact::chow::Chow;
 use cvar_game::exact::law::{Perturbation, evaluate, evaluate_under};
@@ -535,9 +535,9 @@ impl Mdp {
         next: PyReadonlyArray1<'_, i64>,
         probability: PyReadonlyArray1<'_, f64>,
         reward: PyReadonlyArray1<'_, f64>,
-        states: i64,
+        #[pyo3(from_py_with = index)] states: i64,
         start: PyReadonlyArray1<'_, f64>,
-        horizon: i64,
+        #[pyo3(from_py_with = index)] horizon: i64,
         gamma: f64,
     ) -> PyResult<Self> {
         let gamma = discount(gamma)?;
@@ -597,7 +597,7 @@ impl Mdp {
     }
 
     /// Number of actions of a state; 0 where the episode has ended.
-    fn action_count(&self, state: i64) -> PyResult<usize> {
+    fn action_count(&self, #[pyo3(from_py_with = index)] state: i64) -> PyResult<usize> {
         Ok(self.0.outcomes[valid(in_range("state", state, self.0.states()))?].len())
     }
 
@@ -606,8 +606,8 @@ impl Mdp {
     fn outcomes<'py>(
         &self,
         py: Python<'py>,
-        state: i64,
-        action: i64,
+        #[pyo3(from_py_with = index)] state: i64,
+        #[pyo3(from_py_with = index)] action: i64,
     ) -> PyResult<(Bound<'py, PyArray1<i64>>, Bound<'py, PyArray1<f64>>, Bound<'py, PyArray1<f64>>)>
     {
         let actions = &self.0.outcomes[valid(in_range("state", state, self.0.states()))?];
@@ -623,7 +623,11 @@ impl Mdp {
     }
 
     /// The values that the accumulated reward may have at a time, ascending.
-    fn levels<'py>(&self, py: Python<'py>, time: i64) -> PyResult<Bound<'py, PyArray1<f64>>> {
+    fn levels<'py>(
+        &self,
+        py: Python<'py>,
+        #[pyo3(from_py_with = index)] time: i64,
+    ) -> PyResult<Bound<'py, PyArray1<f64>>> {
         let time = valid(in_range("time", time, self.0.horizon()))?;
         Ok(PyArray1::from_iter(py, self.0.levels[time].iter().map(|(value, _)| *value)))
     }
@@ -778,7 +782,12 @@ impl Optimum {
     }
 
     /// The policy's action at a time, with a discounted reward accumulated before it, in a state.
-    fn action(&self, time: i64, accumulated: f64, state: i64) -> PyResult<usize> {
+    fn action(
+        &self,
+        #[pyo3(from_py_with = index)] time: i64,
+        accumulated: f64,
+        #[pyo3(from_py_with = index)] state: i64,
+    ) -> PyResult<usize> {
         let node = valid(self.model.node(time, accumulated, state))?;
         Ok(self.policy.action(&self.model.mdp, node))
     }
@@ -952,7 +961,12 @@ impl MdpWorstCase {
     }
 
     /// The policy's action.
-    fn action(&self, time: i64, accumulated: f64, state: i64) -> PyResult<usize> {
+    fn action(
+        &self,
+        #[pyo3(from_py_with = index)] time: i64,
+        accumulated: f64,
+        #[pyo3(from_py_with = index)] state: i64,
+    ) -> PyResult<usize> {
         let node = valid(self.model().node(time, accumulated, state))?;
         Ok(self.policy.action(&self.model().mdp, node))
     }
@@ -961,16 +975,21 @@ impl MdpWorstCase {
     fn ratios<'py>(
         &self,
         py: Python<'py>,
-        time: i64,
+        #[pyo3(from_py_with = index)] time: i64,
         accumulated: f64,
-        state: i64,
+        #[pyo3(from_py_with = index)] state: i64,
     ) -> PyResult<Bound<'py, PyArray1<f64>>> {
         let node = valid(self.model().node(time, accumulated, state))?;
         Ok(PyArray1::from_iter(py, self.deltas(node)))
     }
 
     /// The budget that is left there; infinite where the tail is out of reach.
-    fn budget(&self, time: i64, accumulated: f64, state: i64) -> PyResult<f64> {
+    fn budget(
+        &self,
+        #[pyo3(from_py_with = index)] time: i64,
+        accumulated: f64,
+        #[pyo3(from_py_with = index)] state: i64,
+    ) -> PyResult<f64> {
         let node = valid(self.model().node(time, accumulated, state))?;
         Ok(1.0 / self.tail.at(node))
     }
