@@ -58,10 +58,17 @@ fn invalid(message: impl Into<String>) -> PyErr {
 
 /// A whole number; one that is too large for any use is bad input as others are.
 fn index(value: &Bound<'_, PyAny>) -> PyResult<i64> {
-    value.extract().map_err(|error: PyErr| {
-        let overflows = error.is_instance_of::<PyOverflowError>(value.py());
-        if overflows { invalid("a whole number is out of range") } else { error }
-    })
+    value.extract().map_err(|error| in_range(value, error))
+}
+
+/// The same for a real number.
+fn real(value: &Bound<'_, PyAny>) -> PyResult<f64> {
+    value.extract().map_err(|error| in_range(value, error))
+}
+
+fn in_range(value: &Bound<'_, PyAny>, error: PyErr) -> PyErr {
+    let overflows = error.is_instance_of::<PyOverflowError>(value.py());
+    if overflows { invalid("a number is out of range") } else { error }
 }
 
 /// A result, whose error is bad input.

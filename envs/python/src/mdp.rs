@@ -10,7 +10,7 @@
 //!   returns of the solver are J + c.
 
 use crate::law::Law;
-use crate::{budget, discount, index, invalid, valid};
+use crate::{budget, discount, index, invalid, real, valid};
 use cvar_game::exact::ExactError;
 use cvar_game::exact::chow::Chow;
 use cvar_game::exact::law::{Perturbation, evaluate, evaluate_under};
@@ -785,7 +785,7 @@ impl Optimum {
     fn action(
         &self,
         #[pyo3(from_py_with = index)] time: i64,
-        accumulated: f64,
+        #[pyo3(from_py_with = real)] accumulated: f64,
         #[pyo3(from_py_with = index)] state: i64,
     ) -> PyResult<usize> {
         let node = valid(self.model.node(time, accumulated, state))?;
@@ -964,7 +964,7 @@ impl MdpWorstCase {
     fn action(
         &self,
         #[pyo3(from_py_with = index)] time: i64,
-        accumulated: f64,
+        #[pyo3(from_py_with = real)] accumulated: f64,
         #[pyo3(from_py_with = index)] state: i64,
     ) -> PyResult<usize> {
         let node = valid(self.model().node(time, accumulated, state))?;
@@ -976,7 +976,7 @@ impl MdpWorstCase {
         &self,
         py: Python<'py>,
         #[pyo3(from_py_with = index)] time: i64,
-        accumulated: f64,
+        #[pyo3(from_py_with = real)] accumulated: f64,
         #[pyo3(from_py_with = index)] state: i64,
     ) -> PyResult<Bound<'py, PyArray1<f64>>> {
         let node = valid(self.model().node(time, accumulated, state))?;
@@ -987,7 +987,7 @@ impl MdpWorstCase {
     fn budget(
         &self,
         #[pyo3(from_py_with = index)] time: i64,
-        accumulated: f64,
+        #[pyo3(from_py_with = real)] accumulated: f64,
         #[pyo3(from_py_with = index)] state: i64,
     ) -> PyResult<f64> {
         let node = valid(self.model().node(time, accumulated, state))?;
