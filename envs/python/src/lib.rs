@@ -26,9 +26,10 @@ use cvar_game::report::figures::{moment, rgb};
 use cvar_game::report::runs::Runs;
 use games::{AnyGames, Autoreset, More, Setup, Stepped};
 use law::Law;
+use numpy::ndarray::{ArrayView, Dimension};
 use numpy::{
-    IntoPyArray, PyArray1, PyArray2, PyArrayMethods, PyReadonlyArray2, PyReadonlyArrayDyn,
-    PyUntypedArrayMethods,
+    Element, IntoPyArray, PyArray1, PyArray2, PyArrayMethods, PyReadonlyArray, PyReadonlyArray2,
+    PyReadonlyArrayDyn, PyUntypedArrayMethods,
 };
 use pyo3::exceptions::{PyOverflowError, PyValueError};
 use pyo3::prelude::*;
@@ -54,6 +55,22 @@ fn invalid(message: impl Into<String>) -> PyErr {
     let message: String = message.into();
     // In one line, also where a path or a name of the user's has several.
     PyValueError::new_err(message.split_whitespace().collect::<Vec<_>>().join(" "))
+}
+
+/// The numbers of an array.
+///
+/// # Errors
+/// If they do not lie in memory as their type has to, as fields of packed records do not.
+fn elements<'a, T: Element, D: Dimension>(
+    array: &'a PyReadonlyArray<'_, T, D>,
+) -> PyResult<ArrayView<'a, T, D>> {
+    let size = size_of::<T>() as isize;
+    let aligned = array.data().is_aligned() && array.strides().iter().all(|step| step % size == 0);
+    if aligned {
+        Ok(array.as_array())
+    } else {
+        Err(invalid("an array is not aligned; pass a copy of it"))
+    }
 }
 
 /// A whole number; one that is too large for any use is bad input as others are.
@@ -149,7 +166,7 @@ impl World {
         py: Python<'py>,
         trail: PyReadonlyArray2<'_, f64>,
     ) -> PyResult<Bound<'py, PyAny>> {
-        let rows = trail.as_array();
+        let rows = elements(&trail)?;
         let trail: Vec<[f64; 2]> = rows.rows().into_iter().map(|row| [row[0], row[1]]).collect();
         let drawn = py.detach(|| {
             let scene = self.world.describe(&self.constants)?.scene;
@@ -186,7 +203,7 @@ impl World {
         gamma: f64,
         opponent: Option<&Opponent>,
     ) -> PyResult<Judged> {
-        let (eta, gamma, table) = (budget(eta)?, discount(gamma)?, read_table(&table));
+        let (eta, gamma, table) = (budget(eta)?, discount(gamma)?, read_table(&table)?);
         let judged = py.detach(|| {
             let chance = opponent.map(Opponent::chance);
             self.world.judge(&self.constants, (gamma, eta), Ok(&table), chance.as_ref())
@@ -241,7 +258,7 @@ impl World {
         eta: f64,
         gamma: f64,
     ) -> PyResult<Bound<'py, PyAny>> {
-        let (eta, gamma, table) = (budget(eta)?, discount(gamma)?, read_table(&table));
+        let (eta, gamma, table) = (budget(eta)?, discount(gamma)?, read_table(&table)?);
         let found = py.detach(|| self.world.worst_case(&self.constants, (gamma, eta), &table));
         let (ratios, shape) = valid(found)?;
         Ok(ratios.into_pyarray(py).reshape(shape)?.into_any())
@@ -294,11 +311,9 @@ impl Table {
     }
 }
 
-fn read_table(table: &PyReadonlyArrayDyn<'_, f64>) -> Table {
-    Table {
-        shape: table.shape().to_vec(),
-        probabilities: table.as_array().iter().copied().collect(),
-    }
+fn read_table(table: &PyReadonlyArrayDyn<'_, f64>) -> PyResult<Table> {
+    let probabilities = elements(table)?.iter().copied().collect();
+    Ok(Table { shape: table.shape().to_vec(), probabilities })
 }
 
 /// A callable of Python's as a protagonist.
@@ -353,7 +368,7 @@ impl Opponent {
     /// The exact worst case of the greedy version of a table.
     #[staticmethod]
     fn worst_case(table: PyReadonlyArrayDyn<'_, f64>, gamma: f64) -> PyResult<Self> {
-        Ok(Opponent(Decides::WorstCase(read_table(&table), discount(gamma)?)))
+        Ok(Opponent(Decides::WorstCase(read_table(&table)?, discount(gamma)?)))
     }
 
     /// The antagonist of a finished run.
@@ -540,8 +555,8 @@ impl Games {
         parameters: Option<PyReadonlyArray2<'py, f32>>,
     ) -> PyResult<Returned<'py>> {
         let actions = Values::of_actions(actions, self.actions)?;
-        let parameters: Option<Vec<f32>> =
-            parameters.map(|array| array.as_array().iter().copied().collect());
+        let numbers = |array| PyResult::Ok(elements(array)?.iter().copied().collect::<Vec<f32>>());
+        let parameters = parameters.as_ref().map(numbers).transpose()?;
         let stepped = py.detach(|| {
             lock(&self.games).step(&actions, parameters.as_deref(), self.autoreset, self.tells)
         });
@@ -696,7 +711,7 @@ impl Run {
         seed: Option<u64>,
     ) -> PyResult<Values> {
         let width = observations.shape()[1];
-        let rows: Vec<f32> = observations.as_array().iter().copied().collect();
+        let rows: Vec<f32> = elements(&observations)?.iter().copied().collect();
         valid(py.detach(|| lock(&self.players).act(&rows, width, seed)))
     }
 

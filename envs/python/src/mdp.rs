@@ -10,7 +10,7 @@
 //!   returns of the solver are J + c.
 
 use crate::law::Law;
-use crate::{budget, discount, index, invalid, real, valid};
+use crate::{budget, discount, elements, index, invalid, real, valid};
 use cvar_game::exact::ExactError;
 use cvar_game::exact::chow::Chow;
 use cvar_game::exact::law::{Perturbation, evaluate, evaluate_under};
@@ -541,16 +541,16 @@ impl Mdp {
         gamma: f64,
     ) -> PyResult<Self> {
         let gamma = discount(gamma)?;
-        let whole = |array: &PyReadonlyArray1<'_, i64>| array.as_array().to_vec();
-        let real = |array: &PyReadonlyArray1<'_, f64>| array.as_array().to_vec();
+        let whole = |array: &PyReadonlyArray1<'_, i64>| PyResult::Ok(elements(array)?.to_vec());
+        let real = |array: &PyReadonlyArray1<'_, f64>| PyResult::Ok(elements(array)?.to_vec());
         let transitions = Transitions {
-            state: whole(&state),
-            action: whole(&action),
-            next: whole(&next),
-            probability: real(&probability),
-            reward: real(&reward),
+            state: whole(&state)?,
+            action: whole(&action)?,
+            next: whole(&next)?,
+            probability: real(&probability)?,
+            reward: real(&reward)?,
         };
-        let mut start = real(&start);
+        let mut start = real(&start)?;
         let sum: f64 = start.iter().sum();
         let made = py.detach(|| {
             normalise(sum, start.iter_mut())
@@ -652,7 +652,7 @@ impl Mdp {
     #[expect(clippy::needless_pass_by_value, reason = "PyO3 gives it away")]
     fn evaluate(&self, py: Python<'_>, policy: PyReadonlyArrayDyn<'_, f64>) -> PyResult<Law> {
         let model = &self.0;
-        let (shape, probabilities) = read(&policy);
+        let (shape, probabilities) = read(&policy)?;
         valid(py.detach(|| {
             let policy = model.policy(&shape, &probabilities)?;
             Ok(model.law(&evaluate(&model.mdp, &policy).law))
@@ -668,7 +668,7 @@ impl Mdp {
         eta: f64,
     ) -> PyResult<MdpWorstCase> {
         let eta = budget(eta)?;
-        let (shape, probabilities) = read(&policy);
+        let (shape, probabilities) = read(&policy)?;
         valid(py.detach(|| {
             let policy = self.0.policy(&shape, &probabilities)?.greedy(&self.0.mdp);
             MdpWorstCase::new(&self.0, policy, eta)
@@ -718,8 +718,8 @@ impl Mdp {
 }
 
 /// Shape and numbers of an array.
-fn read(array: &PyReadonlyArrayDyn<'_, f64>) -> (Vec<usize>, Vec<f64>) {
-    (array.shape().to_vec(), array.as_array().iter().copied().collect())
+fn read(array: &PyReadonlyArrayDyn<'_, f64>) -> PyResult<(Vec<usize>, Vec<f64>)> {
+    Ok((array.shape().to_vec(), elements(array)?.iter().copied().collect()))
 }
 
 /// The best attainable CVaR, and a policy over time, accumulated reward and state that attains it.

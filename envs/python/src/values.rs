@@ -1,7 +1,7 @@
 //! Actions, outcomes and laws as arrays: whole numbers where they are finitely many, rows of coordinates where
 //! they are points of the plane.
 
-use crate::invalid;
+use crate::{elements, invalid};
 use cvar_game::exact::yardstick::Solvable;
 use cvar_game::learn::method::Arena;
 use lava_envs::action::{Action, ActionKind, Finite, Plane};
@@ -54,13 +54,13 @@ impl Values {
             Some(_) => {
                 let array: PyReadonlyArray1<'_, i64> = (array.extract())
                     .map_err(|_| invalid("actions must be integers of shape (slots,)"))?;
-                Ok(Values::Indices(array.as_array().to_vec()))
+                Ok(Values::Indices(elements(&array)?.to_vec()))
             }
             None => {
                 let array: PyReadonlyArray2<'_, f64> = (array.extract())
                     .map_err(|_| invalid("actions must be real numbers of shape (slots, 2)"))?;
                 let width = array.shape()[1];
-                Ok(Values::Rows(array.as_array().iter().copied().collect(), width))
+                Ok(Values::Rows(elements(&array)?.iter().copied().collect(), width))
             }
         }
     }
