@@ -120,3 +120,201 @@ fn the_worlds_of_these_tests_are_worlds() {
     world.place(0, 1, 1);
     assert_eq!(world.time(0), 1);
 }
+
+/// Implicit quantile networks, with the feature `torch`.
+#[cfg(feature = "torch")]
+mod iqn {
+    use super::*;
+    use cvar_game::learn::inputs::{Columns, Rows};
+    use cvar_game::learn::methods::Iqn;
+    use cvar_game::learn::methods::iqn::quantiles::{Levels, Quantiles, Shape, quantile_huber};
+    use rand::rngs::ChaCha8Rng;
+    use rand::{RngExt, SeedableRng};
+    use tch::{Kind, Tensor};
+
+    fn own(risk: &str) -> String {
+        format!(
+            "risk = \"{risk}\"\ncosines = 16\nlevels = 8\npolicy_levels = 32\nkappa = 0.05\n\
+             learning_rate = 0.002\nlearning_rate_final = 0.0\ntail = 0.3\nminibatch = 64\nsteps_per_gradient = 4\ntarget_every = 100\n\
+             replay = 5000\nexploration = 0.2\nexploration_until = 0.5"
+        )
+    }
+
+    fn options() -> TrainOptions {
+        let mut options = super::options();
+        (options.parallel_episodes, options.rollout_steps, options.steps) = (10, 10, 12_000);
+        (options.budget_wait, options.budget_rise) = (0.0, 0.0);
+        options.protagonist.hidden = 32;
+        options
+    }
+
+    /// CVaR_0.5 of what is learned of the fork whose s2 pays `safe`, at the risk level `1 / eta`.
+    fn learned(safe: f64, eta: f64, seed: u64, risk: &str) -> f64 {
+        trained::<Iqn, _>(|slots| fork(safe, slots), &options(), (eta, seed), &own(risk)).cvar(0.5)
+    }
+
+    #[test]
+    fn both_policies_find_the_optimum_of_the_fork() {
+        for seed in 1..=3 {
+            for risk in ["iterated", "static"] {
+                let cvar = learned(0.5, 2.0, seed, risk);
+                assert!((cvar - PASSES).abs() < 0.01, "{risk}, seed {seed}: {cvar}");
+                let cvar = learned(0.5, 1.0, seed, risk);
+                assert!((cvar - GAMBLES).abs() < 0.01, "{risk} at eta = 1, seed {seed}: {cvar}");
+            }
+        }
+    }
+
+    /// What the published policy optimises is iterated (Lim & Malik 2022). Where s2 pays 2, the worst half of the return
+    /// is all of s1, in which gambling has the better mean: CVaR_0.5 is 0.25 by gambling, 0 by passing. The CVaR that is
+    /// taken anew in s1 is -1 by gambling.
+    #[test]
+    fn iterated_cvar_is_not_the_cvar_of_the_return() {
+        for seed in 1..=3 {
+            let iterated = learned(2.0, 2.0, seed, "iterated");
+            assert!(iterated.abs() < 0.01, "iterated, seed {seed}: {iterated}");
+            let repaired = learned(2.0, 2.0, seed, "static");
+            assert!((repaired - 0.25).abs() < 0.015, "static, seed {seed}: {repaired}");
+        }
+    }
+
+    #[test]
+    fn both_policies_find_the_best_push_of_the_gaussian_stake() {
+        for (eta, risk) in [(1.0, "iterated"), (5.0, "iterated"), (5.0, "static")] {
+            let alpha = 1.0 / eta;
+            let shortfall = if eta == 1.0 { 0.0 } else { expected_shortfall(alpha) };
+            let rate = GAIN.mean - GAIN.deviation * shortfall;
+            // The stakes of 16 full pushes, evenly round the circle, and of none.
+            let stakes =
+                (0..16).map(|i| (f64::from(i) * std::f64::consts::PI / 8.0).cos().max(0.0));
+            let best = stakes.map(|stake| stake * rate - stake * stake / 2.0).fold(0.0, f64::max);
+            let world = |slots| Stake::new(&GAIN, slots).unwrap();
+            let cvar = trained::<Iqn, _>(world, &options(), (eta, 1), &own(risk)).cvar(alpha);
+            assert!((cvar - best).abs() < 0.003, "{risk} at {eta}: {cvar}, not {best}");
+        }
+    }
+
+    #[test]
+    fn training_continues_from_a_checkpoint_bit_for_bit() {
+        for risk in ["iterated", "static"] {
+            let (options, own) =
+                (TrainOptions { steps: 2_000, ..options() }, own(risk).parse().unwrap());
+            let (eta, device) = (Eta::new(2.0).unwrap(), Device::Cpu);
+            let setting =
+                Setting { eta, gamma: 0.9, seed: 3, device, options: &options, own: &own };
+            let begin = || Iqn::begin(fork(0.5, options.parallel_episodes), &setting);
+            let mut whole = begin();
+            let mut state = Vec::new();
+            for update in 1.. {
+                if whole.update().unwrap().is_none() {
+                    break;
+                }
+                if update == 7 {
+                    state = whole.state();
+                }
+            }
+            let mut rest = begin();
+            rest.restore(&state).unwrap();
+            assert_eq!((rest.updates(), rest.steps()), (7, 700));
+            while rest.update().unwrap().is_some() {}
+            assert!(rest.state() == whole.state(), "{risk}");
+            state.truncate(state.len() - 1);
+            assert!(begin().restore(&state).is_err());
+        }
+    }
+
+    /// The loss and its gradient by the values, against the formula written out.
+    #[test]
+    fn the_quantile_huber_loss_is_that_of_the_paper() {
+        const KAPPA: f64 = 0.3;
+        let (samples, levels, targets) = (3usize, 4usize, 5usize);
+        let mut random = ChaCha8Rng::seed_from_u64(1);
+        let mut draw = |count: usize| -> Vec<f64> { (0..count).map(|_| random.random()).collect() };
+        let (z, tau, y) = (draw(samples * levels), draw(samples * levels), draw(samples * targets));
+        let (mut loss, mut slopes) = (0.0, vec![0.0; z.len()]);
+        for sample in 0..samples {
+            for i in sample * levels..(sample + 1) * levels {
+                for j in sample * targets..(sample + 1) * targets {
+                    let delta = y[j] - z[i];
+                    let (huber, slope) = if delta.abs() <= KAPPA {
+                        (0.5 * delta * delta, delta)
+                    } else {
+                        (KAPPA * (delta.abs() - 0.5 * KAPPA), KAPPA * delta.signum())
+                    };
+                    let weight = (tau[i] - f64::from(u8::from(delta < 0.0))).abs();
+                    let share = weight / KAPPA / (targets * samples) as f64;
+                    loss += share * huber;
+                    slopes[i] -= share * slope;
+                }
+            }
+        }
+        let tensor = |of: &[f64], columns: usize| Tensor::from_slice(of).view([-1, columns as i64]);
+        let values = tensor(&z, levels).set_requires_grad(true);
+        let own = quantile_huber(&values, &tensor(&tau, levels), &tensor(&y, targets), KAPPA);
+        own.backward();
+        assert!((own.double_value(&[]) - loss).abs() < 1e-6, "{own:?}, not {loss}");
+        let by = Vec::<f64>::try_from(values.grad().reshape([-1])).unwrap();
+        assert!(
+            by.iter().zip(&slopes).all(|(a, b)| (a - b).abs() < 1e-6),
+            "{by:?}, not {slopes:?}"
+        );
+    }
+
+    /// Whatever share of them is in the tail, a mean over levels is that over (0, 1).
+    #[test]
+    fn levels_in_the_tail_have_weights_that_make_up_for_it() {
+        for (alpha, tail) in [(0.04, 0.5), (0.01, 0.3), (1.0, 0.5), (0.04, 0.0)] {
+            let Levels { at, weights } = Levels::stratified(alpha, 40, tail);
+            assert_eq!((at.len(), weights.len()), (40, 40));
+            let sum = |of: fn(f64) -> f64| -> f64 {
+                at.iter()
+                    .zip(&weights)
+                    .map(|(&at, &weight)| f64::from(weight) * of(at.into()))
+                    .sum()
+            };
+            assert!((sum(|_| 1.0) - 1.0).abs() < 1e-6);
+            assert!(
+                (sum(|at| at) - 0.5).abs() < 1e-6 && (sum(|at| at * at) - 1.0 / 3.0).abs() < 1e-3
+            );
+            let within = at.iter().filter(|&&at| f64::from(at) < alpha).count();
+            assert!(tail == 0.0 || alpha == 1.0 || within == (40.0 * tail) as usize, "{within}");
+        }
+        let Levels { at, weights } = Levels::below(0.1, 2);
+        assert_eq!((at, weights), (vec![0.025, 0.075], vec![0.5, 0.5]));
+    }
+
+    /// Fitted to draws of a law, the network answers with its quantiles.
+    #[test]
+    fn the_network_learns_the_quantiles_of_a_law() {
+        let columns = Columns { cells: 0, numbers: 0, critic_only: 0 };
+        let shape = Shape { columns, threshold: false, hidden: 32, cosines: 32, actions: 1 };
+        let mut random = ChaCha8Rng::seed_from_u64(2);
+        let mut network = Quantiles::new(shape, Device::Cpu, &mut random);
+        let mut optimiser = cvar_game::learn::adam::Adam::new(shape.parameters());
+        let mut gradient = Vec::new();
+        let ones = vec![1.0f32; 32];
+        let rows = Rows { cells: &[], numbers: &ones };
+        const STEPS: u32 = 4_000;
+        for step in 0..STEPS {
+            // Uniform on [0, 1], cubed: the tau-quantile is tau^3.
+            let targets: Vec<f32> = (0..32 * 8).map(|_| random.random::<f32>().powi(3)).collect();
+            let levels: Vec<f32> = (0..32 * 8).map(|_| random.random()).collect();
+            let (targets, levels) =
+                (network.tensor(&targets, [32, 8]), network.tensor(&levels, [32, 8]));
+            let loss = |network: &Quantiles| {
+                let values = network.values(&network.inputs(rows, &[]), &levels).squeeze_dim(2);
+                quantile_huber(&values, &levels, &targets, 0.01)
+            };
+            network.differentiate(loss, &mut gradient);
+            let rate = 0.002 * (1.0 - f64::from(step) / f64::from(STEPS));
+            network.change(|parameters| optimiser.step(parameters, &gradient, rate));
+        }
+        let levels = Levels::below(1.0, 9).at;
+        let one = Rows { cells: &[], numbers: &ones[..1] };
+        let values = network.values(&network.inputs(one, &[]), &network.tensor(&levels, [1, -1]));
+        let values = Vec::<f32>::try_from(values.to_kind(Kind::Float).reshape([-1])).unwrap();
+        for (value, level) in values.iter().zip(levels) {
+            assert!((value - level.powi(3)).abs() < 0.03, "{value} at {level}");
+        }
+    }
+}

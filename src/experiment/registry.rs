@@ -57,12 +57,14 @@ macro_rules! registry {
 
 /// The worlds and methods of this program.
 pub fn standard() -> &'static Registry {
-    use crate::learn::methods::{Augmented, CvarPg, Game, Neutral, Rarl, ReturnCapping, Uniform};
+    use crate::learn::methods::{
+        Augmented, CvarPg, Game, Iqn, Neutral, Rarl, ReturnCapping, Uniform,
+    };
     use lava_envs::{LavaGrid, LavaPoint};
     static STANDARD: LazyLock<Registry> = LazyLock::new(|| {
         crate::registry! {
             worlds: LavaGrid, LavaPoint;
-            methods: Game, Neutral, Augmented, ReturnCapping, CvarPg, Rarl, Uniform
+            methods: Game, Neutral, Augmented, ReturnCapping, CvarPg, Rarl, Iqn, Uniform
         }
     });
     &STANDARD

@@ -178,6 +178,10 @@ pub trait HeadOf<A: Action>: ActionKind {
 
     /// The action of a position, where actions are finitely many and it is one of theirs.
     fn from_index(index: usize) -> Option<A>;
+
+    /// The actions among which a method chooses that compares the values of finitely many: all of them where they are,
+    /// in their order.
+    fn repertoire() -> Vec<A>;
 }
 
 impl<const N: usize, A: Discrete> HeadOf<A> for Finite<N> {
@@ -193,6 +197,10 @@ impl<const N: usize, A: Discrete> HeadOf<A> for Finite<N> {
 
     fn from_index(index: usize) -> Option<A> {
         (index < A::COUNT).then(|| A::from_index(index))
+    }
+
+    fn repertoire() -> Vec<A> {
+        (0..A::COUNT).map(A::from_index).collect()
     }
 }
 

@@ -1,5 +1,7 @@
 //! What a batch of samples shows to a network.
 
+use serde::{Deserialize, Serialize};
+
 /// Sizes of a sample.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Columns {
@@ -14,7 +16,7 @@ pub struct Columns {
 
 /// A batch of n samples. A cell stands for its one-hot code, whose product with a matrix is one of the
 /// matrix's columns.
-#[derive(Debug, Clone, Default, PartialEq)]
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub struct Inputs {
     /// The cell of each sample, shape `[n]`; empty where there are none.
     pub cells: Vec<u32>,

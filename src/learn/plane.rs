@@ -196,6 +196,16 @@ impl HeadOf<Force> for Plane {
     fn from_index(_: usize) -> Option<Force> {
         None
     }
+
+    /// 16 full pushes, evenly round the circle, and none.
+    fn repertoire() -> Vec<Force> {
+        const DIRECTIONS: usize = 16;
+        let push = |index: usize| {
+            let (sin, cos) = (index as f64 * 2.0 * PI / DIRECTIONS as f64).sin_cos();
+            Force(Vector2::new(cos, sin))
+        };
+        (0..DIRECTIONS).map(push).chain([Force(Vector2::zeros())]).collect()
+    }
 }
 
 /// Asks the policy that is selected.

@@ -5,7 +5,7 @@ use super::method::{Arena, Setting};
 use super::observation::Observation;
 use super::options::{Credit, TrainOptions};
 use super::pair::{LearnedOpponent, Pair, PpoPolicy};
-use super::policy::{Draw, Mode, Noise, Nominal, Opponent, Streams};
+use super::policy::{Draw, Mode, Noise, Nominal, Opponent, Policy, Streams};
 use super::price::Finished;
 use super::state::{GamesState, SlotState, Unfit};
 use super::trajectories::Trajectories;
@@ -92,22 +92,41 @@ impl<W: Arena> Collector<W> {
         self
     }
 
-    /// Plays the steps of a rollout in every slot; an episode that ends is followed by a new one.
-    pub fn collect(&mut self, pair: &Pair<W>, terms: Terms, options: &TrainOptions) {
+    /// Forgets the last rollout, and lets episodes in which no step was made yet begin on these terms as well.
+    pub fn open(&mut self, terms: Terms) {
         self.protagonist.clear();
         self.antagonist.clear();
         self.action_antagonist.clear();
         self.before.clear();
         self.finished.clear();
         self.weighted.clear();
-        let mut policy = PpoPolicy::new(&pair.protagonist, pair.observation);
-        let mut opponent = if terms.eta.is_neutral() { None } else { pair.opponent(false) };
         for slot in 0..self.game.slots() {
-            // No step was made yet: the episode has this budget as well.
             if self.game.world.time(slot) == 0 {
                 self.begin(slot, terms);
             }
         }
+    }
+
+    /// Plays a step of any policy under nominal chance in every slot, for `record` to see before episodes that ended
+    /// with it are followed by new ones.
+    pub fn step<P: Policy<W>>(
+        &mut self,
+        policy: &mut P,
+        terms: Terms,
+        record: impl FnOnce(&P, &VectorGame<W>),
+    ) {
+        self.game.step(policy, terms.mode, &mut Nominal, Draw::Perturbed);
+        record(policy, &self.game);
+        for slot in 0..self.game.slots() {
+            self.count(slot, terms);
+        }
+    }
+
+    /// Plays the steps of a rollout in every slot; an episode that ends is followed by a new one.
+    pub fn collect(&mut self, pair: &Pair<W>, terms: Terms, options: &TrainOptions) {
+        self.open(terms);
+        let mut policy = PpoPolicy::new(&pair.protagonist, pair.observation);
+        let mut opponent = if terms.eta.is_neutral() { None } else { pair.opponent(false) };
         for _ in 0..options.rollout_steps {
             let chance: &mut dyn Opponent<W> = match &mut opponent {
                 Some(opponent) => opponent,

@@ -53,14 +53,29 @@ pub fn to_bytes(
     networks: &[(&'static str, &Network)],
     about: String,
 ) -> Result<Vec<u8>, WeightsError> {
-    let mut tensors = BTreeMap::new();
-    for &(player, network) in networks {
-        for (name, tensor) in layout(player, network.shape()) {
-            let bytes: Vec<u8> =
-                tensor.indices().flat_map(|at| network.parameters()[at].to_le_bytes()).collect();
-            tensors.insert(name, (tensor.shape, bytes));
-        }
-    }
+    let places = networks.iter().flat_map(|&(player, network)| {
+        layout(player, network.shape()).into_iter().map(|(name, tensor)| {
+            let numbers = tensor.indices().map(|at| network.parameters()[at]).collect();
+            (name, tensor.shape, numbers)
+        })
+    });
+    tensors_to_bytes(places, about)
+}
+
+/// Tensors by their names, each with its shape and its numbers, as the bytes of a safetensors file, with `about` in its
+/// header.
+///
+/// # Errors
+/// If the format refuses a tensor.
+pub fn tensors_to_bytes(
+    tensors: impl IntoIterator<Item = (String, Vec<usize>, Vec<f32>)>,
+    about: String,
+) -> Result<Vec<u8>, WeightsError> {
+    let to_bytes = |(name, shape, numbers): (String, Vec<usize>, Vec<f32>)| {
+        let bytes: Vec<u8> = numbers.iter().flat_map(|number| number.to_le_bytes()).collect();
+        (name, (shape, bytes))
+    };
+    let tensors: BTreeMap<_, _> = tensors.into_iter().map(to_bytes).collect();
     let views = tensors
         .iter()
         .map(|(name, (shape, bytes))| {
@@ -93,6 +108,23 @@ impl<'a> Weights<'a> {
         Ok(Weights(SafeTensors::deserialize(bytes)?))
     }
 
+    /// The numbers of a tensor of this shape.
+    ///
+    /// # Errors
+    /// If it is absent or of another shape.
+    pub fn numbers(&self, name: &str, shape: &[usize]) -> Result<Vec<f32>, WeightsError> {
+        let refuse = |found: String| WeightsError::Tensor {
+            name: name.to_owned(),
+            expected: shape.to_vec(),
+            found,
+        };
+        let view = self.0.tensor(name).map_err(|_| refuse("none".to_owned()))?;
+        if view.dtype() != Dtype::F32 || view.shape() != shape {
+            return Err(refuse(format!("{:?} of {:?}", view.shape(), view.dtype())));
+        }
+        Ok(view.data().as_chunks().0.iter().map(|bytes| f32::from_le_bytes(*bytes)).collect())
+    }
+
     /// The network of a player.
     ///
     /// # Errors
@@ -105,17 +137,8 @@ impl<'a> Weights<'a> {
     ) -> Result<Network, WeightsError> {
         let mut parameters = vec![0.0; shape.parameters()];
         for (name, tensor) in layout(player, shape) {
-            let refuse = |found: String| WeightsError::Tensor {
-                name: name.clone(),
-                expected: tensor.shape.clone(),
-                found,
-            };
-            let view = self.0.tensor(&name).map_err(|_| refuse("none".to_owned()))?;
-            if view.dtype() != Dtype::F32 || view.shape() != tensor.shape {
-                return Err(refuse(format!("{:?} of {:?}", view.shape(), view.dtype())));
-            }
-            for (at, bytes) in tensor.indices().zip(view.data().as_chunks::<4>().0) {
-                parameters[at] = f32::from_le_bytes(*bytes);
+            for (at, number) in tensor.indices().zip(self.numbers(&name, &tensor.shape)?) {
+                parameters[at] = number;
             }
         }
         let network = Network::from_parameters(shape, parameters, device);

@@ -78,6 +78,19 @@ fn index(value: &Bound<'_, PyAny>) -> PyResult<i64> {
     value.extract().map_err(|error| in_range(value, error))
 }
 
+/// A list of whole numbers, of which there is one for a slot at most.
+fn indices(value: &Bound<'_, PyAny>) -> PyResult<Vec<u64>> {
+    if value.len()? as u64 > MOST {
+        return Err(invalid("there are more numbers than slots"));
+    }
+    value.extract().map_err(|error| in_range(value, error))
+}
+
+/// The same where it may be absent.
+fn indices_if_any(value: &Bound<'_, PyAny>) -> PyResult<Option<Vec<u64>>> {
+    if value.is_none() { Ok(None) } else { indices(value).map(Some) }
+}
+
 /// The same for a real number.
 fn real(value: &Bound<'_, PyAny>) -> PyResult<f64> {
     value.extract().map_err(|error| in_range(value, error))
@@ -167,6 +180,9 @@ impl World {
         trail: PyReadonlyArray2<'_, f64>,
     ) -> PyResult<Bound<'py, PyAny>> {
         let rows = elements(&trail)?;
+        if rows.ncols() != 2 {
+            return Err(invalid("a way has two coordinates"));
+        }
         let trail: Vec<[f64; 2]> = rows.rows().into_iter().map(|row| [row[0], row[1]]).collect();
         let drawn = py.detach(|| {
             let scene = self.world.describe(&self.constants)?.scene;
@@ -529,12 +545,13 @@ impl Games {
     fn reset<'py>(
         &self,
         py: Python<'py>,
-        slots: Vec<usize>,
-        seeds: Option<Vec<u64>>,
+        #[pyo3(from_py_with = indices)] slots: Vec<u64>,
+        #[pyo3(from_py_with = indices_if_any)] seeds: Option<Vec<u64>>,
     ) -> PyResult<Matrix<'py, f32>> {
-        if let Some(slot) = slots.iter().find(|slot| **slot >= self.slots) {
+        if let Some(slot) = slots.iter().find(|slot| **slot >= self.slots as u64) {
             return Err(invalid(format!("there is no slot {slot}")));
         }
+        let slots: Vec<usize> = slots.into_iter().map(|slot| slot as usize).collect();
         if seeds.as_ref().is_some_and(|seeds| seeds.len() != slots.len()) {
             return Err(invalid("there must be a seed for each slot"));
         }

@@ -3,6 +3,7 @@
 pub mod augmented;
 pub mod cvar_pg;
 pub mod game;
+pub mod iqn;
 pub mod neutral;
 pub mod rarl;
 pub mod return_capping;
@@ -11,6 +12,7 @@ pub mod uniform;
 pub use augmented::Augmented;
 pub use cvar_pg::CvarPg;
 pub use game::Game;
+pub use iqn::Iqn;
 pub use neutral::Neutral;
 pub use rarl::Rarl;
 pub use return_capping::ReturnCapping;

@@ -162,6 +162,69 @@ pub(super) fn regret(panels: &[Panel]) -> Option<(Picture, String)> {
     Some((svg, caption.to_owned()))
 }
 
+/// Regrets of at most this are drawn as this.
+const LEAST_REGRET: f64 = 1e-3;
+
+/// The performance profile: the share of runs whose regret is at most so much (Agarwal and others, NeurIPS 2021). A run
+/// without a result never is among them.
+pub(super) fn profile(panels: &[Panel]) -> Option<(Picture, String)> {
+    let place = |regret: &f64| regret.max(LEAST_REGRET).log10();
+    let found: Vec<Vec<f64>> = (panels.iter())
+        .map(|panel| {
+            let regrets = panel.group.measures.iter().filter_map(|of| of.regret);
+            let mut places: Vec<f64> = regrets.map(|regret| place(&regret)).collect();
+            places.sort_by(f64::total_cmp);
+            places
+        })
+        .collect();
+    let mut etas: Vec<f64> = (panels.iter().zip(&found))
+        .filter(|(_, places)| !places.is_empty())
+        .map(|(panel, _)| panel.group.eta)
+        .collect();
+    etas.sort_by(f64::total_cmp);
+    etas.dedup();
+    let x = span(found.iter().flatten().copied().chain([LEAST_REGRET.log10()]))?;
+    // The rows of one method have one colour in all charts.
+    let name = |panel: &Panel| panel.group.method.clone().unwrap_or_else(|| "all runs".to_owned());
+    let mut names: Vec<String> = Vec::new();
+    for panel in panels {
+        if !names.contains(&name(panel)) {
+            names.push(name(panel));
+        }
+    }
+    let words = names.iter().enumerate().map(|(i, name)| (name.clone(), colour(i)));
+    let width = 690 * etas.len().max(1) as u32;
+    let legend = Legend::new(if names.len() > 1 { words.collect() } else { Vec::new() }, width);
+    let svg = figure((width, legend.height + 674), |canvas| {
+        let (top, below) = canvas.split_vertically(legend.height);
+        legend.draw(&top)?;
+        for (area, &eta) in below.split_evenly((1, etas.len())).iter().zip(&etas) {
+            let (x_title, y_title) = ("log10 of regret", "share of runs");
+            let axes = Axes { x: x.clone(), y: 0.0..1.02, x_title, y_title };
+            let mut chart = chart(area, &format!("eta = {eta}"), axes)?;
+            for (panel, places) in panels.iter().zip(&found) {
+                if panel.group.eta != eta || places.is_empty() {
+                    continue;
+                }
+                let runs = panel.group.measures.len() as f64;
+                let step =
+                    |(i, &at): (usize, &f64)| [(at, i as f64 / runs), (at, (i + 1) as f64 / runs)];
+                let steps = places.iter().enumerate().flat_map(step);
+                let ends = [(x.start, 0.0), (x.end, places.len() as f64 / runs)];
+                let line = ends[..1].iter().copied().chain(steps).chain(ends[1..].iter().copied());
+                let method = names.iter().position(|of| *of == name(panel)).unwrap_or_default();
+                chart.draw_series(LineSeries::new(line, colour(method).stroke_width(4)))?;
+            }
+        }
+        Ok(())
+    })?;
+    let caption = format!(
+        "The share of runs whose regret at 1/eta is at most that of the axis (a performance profile): further up and to \
+         the left is better. Regrets below {LEAST_REGRET} are drawn there; a run without a result is in none."
+    );
+    Some((svg, caption))
+}
+
 pub(super) fn budget(panels: &[Panel]) -> Option<(Picture, String)> {
     let by_time = |every: u32, values: &[f64]| {
         (0..)

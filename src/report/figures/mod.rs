@@ -136,6 +136,10 @@ impl Figures {
         if optima.is_some() || regret.is_some() {
             add("regret", "regret in training", regret);
         }
+        let profile = curves::profile(panels);
+        if profile.is_some() {
+            add("profile", "performance profile", profile);
+        }
         add("cross", "every policy at every level", curves::cross(panels));
         add("learning", "learning curves", curves::learning(panels));
         add("budget", "the budget over time", curves::budget(panels));
