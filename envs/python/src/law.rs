@@ -1,6 +1,6 @@
 //! The law of a return.
 
-use crate::invalid;
+use crate::{Real, invalid};
 use cvar_game::game::returns::{Atom, ReturnLaw};
 use lava_envs::End;
 use numpy::{IntoPyArray, PyArray1};
@@ -18,7 +18,7 @@ impl Law {
     }
 }
 
-fn level(alpha: f64) -> PyResult<f64> {
+fn level(Real(alpha): Real) -> PyResult<f64> {
     let possible = alpha > 0.0 && alpha <= 1.0;
     possible.then_some(alpha).ok_or_else(|| invalid(format!("alpha = {alpha} must be in (0, 1]")))
 }
@@ -65,12 +65,12 @@ impl Law {
     }
 
     /// The lower alpha-quantile.
-    fn var(&self, alpha: f64) -> PyResult<f64> {
+    fn var(&self, alpha: Real) -> PyResult<f64> {
         Ok(self.0.var(level(alpha)?))
     }
 
     /// The mean of the worst alpha of the outcomes.
-    fn cvar(&self, alpha: f64) -> PyResult<f64> {
+    fn cvar(&self, alpha: Real) -> PyResult<f64> {
         Ok(self.0.cvar(level(alpha)?))
     }
 
@@ -80,7 +80,7 @@ impl Law {
     }
 
     /// Standard error of the CVaR; 0 for an exact law.
-    fn cvar_standard_error(&self, alpha: f64) -> PyResult<f64> {
+    fn cvar_standard_error(&self, alpha: Real) -> PyResult<f64> {
         Ok(self.0.cvar_standard_error(level(alpha)?))
     }
 }

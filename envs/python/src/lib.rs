@@ -91,9 +91,16 @@ fn indices_if_any(value: &Bound<'_, PyAny>) -> PyResult<Option<Vec<u64>>> {
     if value.is_none() { Ok(None) } else { indices(value).map(Some) }
 }
 
-/// The same for a real number.
-fn real(value: &Bound<'_, PyAny>) -> PyResult<f64> {
-    value.extract().map_err(|error| in_range(value, error))
+/// A real number, likewise.
+#[derive(Debug, Clone, Copy)]
+struct Real(f64);
+
+impl<'a, 'py> FromPyObject<'a, 'py> for Real {
+    type Error = PyErr;
+
+    fn extract(value: Borrowed<'a, 'py, PyAny>) -> PyResult<Self> {
+        value.extract().map(Real).map_err(|error| in_range(&value, error))
+    }
 }
 
 fn in_range(value: &Bound<'_, PyAny>, error: PyErr) -> PyErr {
@@ -106,11 +113,11 @@ fn valid<T>(result: Result<T, String>) -> PyResult<T> {
     result.map_err(invalid)
 }
 
-fn budget(eta: f64) -> PyResult<Eta> {
+fn budget(Real(eta): Real) -> PyResult<Eta> {
     Eta::new(eta).map_err(|error| invalid(error.to_string()))
 }
 
-fn discount(gamma: f64) -> PyResult<f64> {
+fn discount(Real(gamma): Real) -> PyResult<f64> {
     let possible = gamma > 0.0 && gamma <= 1.0;
     possible.then_some(gamma).ok_or_else(|| invalid(format!("gamma = {gamma} must be in (0, 1]")))
 }
@@ -195,7 +202,7 @@ impl World {
 
     /// All that is known of the optimum at a budget: the JSON of `cvar-game exact`. What takes minutes is
     /// computed only if `compute` is true.
-    fn exact(&self, py: Python<'_>, eta: f64, gamma: f64, compute: bool) -> PyResult<String> {
+    fn exact(&self, py: Python<'_>, eta: Real, gamma: Real, compute: bool) -> PyResult<String> {
         let (eta, gamma) = (budget(eta)?, discount(gamma)?);
         py.detach(|| {
             use cvar_game::exact::yardstick::{Options, Source};
@@ -215,8 +222,8 @@ impl World {
         &self,
         py: Python<'_>,
         table: PyReadonlyArrayDyn<'_, f64>,
-        eta: f64,
-        gamma: f64,
+        eta: Real,
+        gamma: Real,
         opponent: Option<&Opponent>,
     ) -> PyResult<Judged> {
         let (eta, gamma, table) = (budget(eta)?, discount(gamma)?, read_table(&table)?);
@@ -228,7 +235,7 @@ impl World {
     }
 
     /// The comparison of a policy by the law of its return.
-    fn judge_law(&self, py: Python<'_>, law: &Law, eta: f64, gamma: f64) -> PyResult<Judged> {
+    fn judge_law(&self, py: Python<'_>, law: &Law, eta: Real, gamma: Real) -> PyResult<Judged> {
         let (eta, gamma) = (budget(eta)?, discount(gamma)?);
         let judged =
             py.detach(|| self.world.judge(&self.constants, (gamma, eta), Err(&law.0), None));
@@ -239,8 +246,8 @@ impl World {
     fn optimal_policy<'py>(
         &self,
         py: Python<'py>,
-        eta: f64,
-        gamma: f64,
+        eta: Real,
+        gamma: Real,
     ) -> PyResult<Option<Bound<'py, PyAny>>> {
         let at = (discount(gamma)?, budget(eta)?);
         let table = valid(py.detach(|| self.world.optimal_policy(&self.constants, at)))?;
@@ -271,8 +278,8 @@ impl World {
         &self,
         py: Python<'py>,
         table: PyReadonlyArrayDyn<'_, f64>,
-        eta: f64,
-        gamma: f64,
+        eta: Real,
+        gamma: Real,
     ) -> PyResult<Bound<'py, PyAny>> {
         let (eta, gamma, table) = (budget(eta)?, discount(gamma)?, read_table(&table)?);
         let found = py.detach(|| self.world.worst_case(&self.constants, (gamma, eta), &table));
@@ -288,8 +295,8 @@ impl World {
         &self,
         py: Python<'py>,
         policy: Py<PyAny>,
-        eta: f64,
-        gamma: f64,
+        eta: Real,
+        gamma: Real,
         episodes: u64,
         slots: u64,
         seed: u64,
@@ -383,7 +390,7 @@ impl Opponent {
 
     /// The exact worst case of the greedy version of a table.
     #[staticmethod]
-    fn worst_case(table: PyReadonlyArrayDyn<'_, f64>, gamma: f64) -> PyResult<Self> {
+    fn worst_case(table: PyReadonlyArrayDyn<'_, f64>, gamma: Real) -> PyResult<Self> {
         Ok(Opponent(Decides::WorstCase(read_table(&table)?, discount(gamma)?)))
     }
 
@@ -395,7 +402,8 @@ impl Opponent {
 
     /// Python, by the parameters of a family of perturbations (`train.family`).
     #[staticmethod]
-    fn played(kind: &str, count: usize, center: f64, curvature: f64) -> PyResult<Self> {
+    fn played(kind: &str, count: usize, center: Real, curvature: Real) -> PyResult<Self> {
+        let (Real(center), Real(curvature)) = (center, curvature);
         let kind = kind.to_owned();
         let in_range = (1..=3).contains(&count)
             && (center > 0.0 && center <= 100.0)
@@ -496,7 +504,7 @@ impl Games {
         slots: u64,
         features: bool,
         time: bool,
-        eta: f64,
+        eta: Real,
         opponent: &Opponent,
         autoreset: &str,
         tells: bool,
@@ -749,11 +757,11 @@ fn write_run(
     world: &World,
     judged: &Judged,
     method: &str,
-    eta: f64,
-    gamma: f64,
+    eta: Real,
+    gamma: Real,
     seed: u64,
     steps: u64,
-    seconds: f64,
+    seconds: Real,
     clearance: Option<f64>,
 ) -> PyResult<PathBuf> {
     let text = |error: &dyn std::fmt::Display| invalid(error.to_string());
@@ -778,7 +786,7 @@ fn write_run(
     plays.extend(judged.sampled.as_ref().map(|law| play(Mode::Sampled, law, None)));
     let certificate = judged.comparison.map(Certificate::from);
     let findings = Findings { plays, audit: None, certificate };
-    let evaluation = Evaluation::new(&run, (steps, seconds), findings);
+    let evaluation = Evaluation::new(&run, (steps, seconds.0), findings);
     let folder = run.folder(&out);
     let mut task = toml::Table::new();
     task.insert("gamma".to_owned(), discount(gamma)?.into());

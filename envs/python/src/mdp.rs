@@ -10,7 +10,7 @@
 //!   returns of the solver are J + c.
 
 use crate::law::Law;
-use crate::{budget, discount, elements, index, invalid, real, valid};
+use crate::{Real, budget, discount, elements, index, invalid, valid};
 use cvar_game::exact::ExactError;
 use cvar_game::exact::chow::Chow;
 use cvar_game::exact::law::{Perturbation, evaluate, evaluate_under};
@@ -538,7 +538,7 @@ impl Mdp {
         #[pyo3(from_py_with = index)] states: i64,
         start: PyReadonlyArray1<'_, f64>,
         #[pyo3(from_py_with = index)] horizon: i64,
-        gamma: f64,
+        gamma: Real,
     ) -> PyResult<Self> {
         let gamma = discount(gamma)?;
         let whole = |array: &PyReadonlyArray1<'_, i64>| PyResult::Ok(elements(array)?.to_vec());
@@ -638,12 +638,12 @@ impl Mdp {
     }
 
     /// The best attainable CVaR and a policy that attains it.
-    fn optimum(&self, py: Python<'_>, alpha: f64) -> PyResult<Optimum> {
+    fn optimum(&self, py: Python<'_>, alpha: Real) -> PyResult<Optimum> {
         let model = &self.0;
         let found = py.detach(|| {
-            let policy = model.merged(optimum::optimum(&model.mdp, alpha)?.policy);
+            let policy = model.merged(optimum::optimum(&model.mdp, alpha.0)?.policy);
             let law = model.law(&evaluate(&model.mdp, &policy).law);
-            Ok(Optimum { model: Arc::clone(model), policy, law, alpha })
+            Ok(Optimum { model: Arc::clone(model), policy, law, alpha: alpha.0 })
         });
         found.map_err(|error: ExactError| invalid(error.to_string()))
     }
@@ -665,7 +665,7 @@ impl Mdp {
         &self,
         py: Python<'_>,
         policy: PyReadonlyArrayDyn<'_, f64>,
-        eta: f64,
+        eta: Real,
     ) -> PyResult<MdpWorstCase> {
         let eta = budget(eta)?;
         let (shape, probabilities) = read(&policy)?;
@@ -676,7 +676,7 @@ impl Mdp {
     }
 
     /// The value that the budget-augmented programme reports, which no policy need attain.
-    fn chow(&self, py: Python<'_>, eta: f64) -> PyResult<f64> {
+    fn chow(&self, py: Python<'_>, eta: Real) -> PyResult<f64> {
         let (eta, model) = (budget(eta)?, &self.0);
         let returns = model.mdp.returns().len();
         let largest = model.blocks.windows(2).map(|pair| pair[1] - pair[0]).max().unwrap_or(0);
@@ -697,12 +697,12 @@ impl Mdp {
     fn best_stationary<'py>(
         &self,
         py: Python<'py>,
-        alpha: f64,
+        alpha: Real,
     ) -> PyResult<(Law, Bound<'py, PyArray1<i64>>, bool, usize)> {
         let model = &self.0;
         let found = py.detach(|| {
-            let best = optimum::optimum(&model.mdp, alpha)?;
-            stationary::search(&model.mdp, alpha, &best.policy)
+            let best = optimum::optimum(&model.mdp, alpha.0)?;
+            stationary::search(&model.mdp, alpha.0, &best.policy)
         });
         let found = found.map_err(|error| invalid(error.to_string()))?;
         let action = |state: usize| match model.ended(state) {
@@ -785,10 +785,10 @@ impl Optimum {
     fn action(
         &self,
         #[pyo3(from_py_with = index)] time: i64,
-        #[pyo3(from_py_with = real)] accumulated: f64,
+        accumulated: Real,
         #[pyo3(from_py_with = index)] state: i64,
     ) -> PyResult<usize> {
-        let node = valid(self.model.node(time, accumulated, state))?;
+        let node = valid(self.model.node(time, accumulated.0, state))?;
         Ok(self.policy.action(&self.model.mdp, node))
     }
 
@@ -806,7 +806,7 @@ impl Optimum {
     }
 
     /// The worst case of the policy.
-    fn worst_case(&self, py: Python<'_>, eta: f64) -> PyResult<MdpWorstCase> {
+    fn worst_case(&self, py: Python<'_>, eta: Real) -> PyResult<MdpWorstCase> {
         let eta = budget(eta)?;
         valid(py.detach(|| MdpWorstCase::new(&self.model, self.policy.clone(), eta)))
     }
@@ -964,10 +964,10 @@ impl MdpWorstCase {
     fn action(
         &self,
         #[pyo3(from_py_with = index)] time: i64,
-        #[pyo3(from_py_with = real)] accumulated: f64,
+        accumulated: Real,
         #[pyo3(from_py_with = index)] state: i64,
     ) -> PyResult<usize> {
-        let node = valid(self.model().node(time, accumulated, state))?;
+        let node = valid(self.model().node(time, accumulated.0, state))?;
         Ok(self.policy.action(&self.model().mdp, node))
     }
 
@@ -976,10 +976,10 @@ impl MdpWorstCase {
         &self,
         py: Python<'py>,
         #[pyo3(from_py_with = index)] time: i64,
-        #[pyo3(from_py_with = real)] accumulated: f64,
+        accumulated: Real,
         #[pyo3(from_py_with = index)] state: i64,
     ) -> PyResult<Bound<'py, PyArray1<f64>>> {
-        let node = valid(self.model().node(time, accumulated, state))?;
+        let node = valid(self.model().node(time, accumulated.0, state))?;
         Ok(PyArray1::from_iter(py, self.deltas(node)))
     }
 
@@ -987,10 +987,10 @@ impl MdpWorstCase {
     fn budget(
         &self,
         #[pyo3(from_py_with = index)] time: i64,
-        #[pyo3(from_py_with = real)] accumulated: f64,
+        accumulated: Real,
         #[pyo3(from_py_with = index)] state: i64,
     ) -> PyResult<f64> {
-        let node = valid(self.model().node(time, accumulated, state))?;
+        let node = valid(self.model().node(time, accumulated.0, state))?;
         Ok(1.0 / self.tail.at(node))
     }
 

@@ -57,6 +57,7 @@ const EMBEDDED: &[(&str, &str)] = &[
     ("configs/coordinates.toml", include_str!("../../../configs/coordinates.toml")),
     ("configs/ablations.toml", include_str!("../../../configs/ablations.toml")),
     ("configs/methods.toml", include_str!("../../../configs/methods.toml")),
+    ("configs/iqn.toml", include_str!("../../../configs/iqn.toml")),
 ];
 
 /// The embedded small benchmark.
