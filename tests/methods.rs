@@ -136,7 +136,7 @@ mod iqn {
         format!(
             "risk = \"{risk}\"\ncosines = 16\nlevels = 8\npolicy_levels = 32\nkappa = 0.05\n\
              learning_rate = 0.002\nlearning_rate_final = 0.0\ntail = 0.3\nminibatch = 64\nsteps_per_gradient = 4\ntarget_every = 100\n\
-             replay = 5000\nexploration = 0.2\nexploration_until = 0.5"
+             replay = 20000\nexploration = 0.5\nexploration_until = 0.5"
         )
     }
 
