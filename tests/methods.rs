@@ -169,7 +169,6 @@ mod iqn {
     /// is all of s1, in which gambling has the better mean: CVaR_0.5 is 0.25 by gambling, 0 by passing. The CVaR that is
     /// taken anew in s1 is -1 by gambling.
     #[test]
-    #[ignore = "one of three seeds of `iterated` gambled"]
     fn iterated_cvar_is_not_the_cvar_of_the_return() {
         for seed in 1..=3 {
             let iterated = learned(2.0, 2.0, seed, "iterated");

@@ -246,6 +246,7 @@ struct IqnPolicy<'a, W> {
 impl<W: Arena> IqnPolicy<'_, W> {
     /// The best action of every slot.
     fn best(&mut self, world: &W) -> Vec<i64> {
+        self.players.observation.protagonist(world, &mut self.inputs);
         let model = world.finite().filter(|_| self.starts.is_empty());
         let Some(model) = model else { return self.judge(world) };
         let slots = 0..world.episodes();
@@ -259,9 +260,9 @@ impl<W: Arena> IqnPolicy<'_, W> {
         })
     }
 
+    /// The same for what it sees already, without what is known.
     fn judge(&mut self, world: &W) -> Vec<i64> {
         let players = self.players;
-        players.observation.protagonist(world, &mut self.inputs);
         self.thresholds.clear();
         if players.own.risk == Risk::Static {
             self.thresholds.extend((0..world.episodes()).map(|slot| {
