@@ -135,6 +135,9 @@ impl World for Fork {
     fn episodes(&self) -> usize {
         self.slots.len()
     }
+    fn return_range(&self, _: f64) -> Option<[f64; 2]> {
+        Some([-1.0, self.constants.safe.max(1.5)])
+    }
     fn horizon(&self) -> u32 {
         3
     }
