@@ -125,6 +125,7 @@ fn every_figure_is_drawn_as_svg_with_text_and_as_png() {
             "lava-grid-deviations",
             "lava-grid-frontier",
             "lava-grid-regret",
+            "lava-grid-profile",
             "lava-grid-cross",
             "lava-grid-learning",
             "lava-grid-budget",
@@ -132,6 +133,7 @@ fn every_figure_is_drawn_as_svg_with_text_and_as_png() {
             "lava-point-shifts",
             "lava-point-frontier",
             "lava-point-regret",
+            "lava-point-profile",
             "lava-point-cross",
             "lava-point-learning",
             "lava-point-budget",
@@ -245,9 +247,11 @@ fn runs_without_figure_data_report_all_the_same() {
             "lava-grid-map",
             "lava-grid-frontier",
             "lava-grid-regret",
+            "lava-grid-profile",
             "lava-grid-cross",
             "lava-grid-learning",
             "lava-point-frontier",
+            "lava-point-profile",
             "lava-point-cross",
         ]
     );
@@ -281,7 +285,7 @@ fn damaged_figure_data_is_named_and_left_out() {
         let written = report::write_all(dir.path(), standard()).unwrap();
         let [note] = &written.figures.notes[..] else { panic!("{:?}", written.figures.notes) };
         assert!(note.contains("seed-2/figure_data.json") && note.contains(said), "{note}");
-        assert_eq!(written.figures.drawn.len(), 15);
+        assert_eq!(written.figures.drawn.len(), 17);
         let page = fs::read_to_string(dir.path().join("report.html")).unwrap();
         assert!(page.contains("Missing in the figures: ") && page.contains(said));
     }
