@@ -498,7 +498,7 @@ impl<W: Arena> Training<W> for IqnTraining<'_, W> {
             }
             sums = [sums[0] + loss, sums[1] + norm];
             self.gradient_steps += 1;
-            if self.gradient_steps % self.players.own.target_every == 0 {
+            if self.gradient_steps.is_multiple_of(self.players.own.target_every) {
                 let new = self.players.network.parameters();
                 self.target.change(|parameters| parameters.copy_from_slice(new));
             }
