@@ -234,8 +234,8 @@ mod iqn {
         let (mut loss, mut slopes) = (0.0, vec![0.0; z.len()]);
         for sample in 0..samples {
             for i in sample * levels..(sample + 1) * levels {
-                for j in sample * targets..(sample + 1) * targets {
-                    let delta = y[j] - z[i];
+                for target in &y[sample * targets..][..targets] {
+                    let delta = target - z[i];
                     let (huber, slope) = if delta.abs() <= KAPPA {
                         (0.5 * delta * delta, delta)
                     } else {
