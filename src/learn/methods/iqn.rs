@@ -50,7 +50,7 @@ pub enum Risk {
 }
 
 /// The options of the method.
-#[derive(Debug, Clone, Deserialize)]
+#[derive(Debug, Clone, Copy, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Options {
     /// What the policy maximises.

@@ -11,7 +11,6 @@ use crate::learn::head::HeadOf;
 use crate::learn::inputs::Inputs;
 use crate::learn::method::{Arena, Players, Progress, Setting, TrainError, Training};
 use crate::learn::observation::Observation;
-use crate::learn::options::Role;
 use crate::learn::policy::{Mode, Opponent, Policy, Streams};
 use crate::learn::rollout::{Collector, Terms};
 use crate::learn::schedule::{self, Turn};
@@ -35,13 +34,13 @@ const THRESHOLDS: usize = 101;
 /// Levels of which the law of the return is made there, for tails as thin as 1 %.
 const START_LEVELS: usize = 200;
 
-/// What the repair needs besides the network.
+/// What the repair needs besides the network, to the bit as a file of weights has it.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 struct Threshold {
     /// w_0.
-    start: f64,
+    start: f32,
     /// What a step earns with which the episode does not end.
-    running: f64,
+    running: f32,
 }
 
 /// The protagonist.
@@ -80,7 +79,7 @@ impl<W: Arena> IqnPlayers<W> {
         let network =
             Quantiles::new(shape, device, &mut stream(seed, Purpose::ProtagonistWeights, 0));
         let range = world.return_range(gamma).unwrap_or([-1.0, 1.0]);
-        let threshold = Threshold { start: range[1], running: 0.0 };
+        let threshold = Threshold { start: range[1] as f32, running: 0.0 };
         let (world, alpha) = (PhantomData, eta.alpha());
         let levels = levels(&network, &own, alpha, own.policy_levels);
         IqnPlayers {
@@ -114,7 +113,7 @@ impl<W: Arena> IqnPlayers<W> {
     /// w_t of an episode that began with w_0 = `start`.
     fn threshold_at(&self, start: f64, time: u32) -> f64 {
         let mut so_far = ReturnSoFar::START;
-        (0..time).for_each(|_| so_far.add(self.threshold.running, self.gamma));
+        (0..time).for_each(|_| so_far.add(self.threshold.running.into(), self.gamma));
         so_far.missing(start)
     }
 
@@ -172,7 +171,7 @@ impl<W: Arena> IqnPlayers<W> {
             (w - (w - f64::from(worth[i])) / self.alpha, w)
         };
         let best = (0..THRESHOLDS).map(objective).max_by(|a, b| a.0.total_cmp(&b.0));
-        self.threshold.start = best.map_or(self.threshold.start, |(_, w)| w);
+        self.threshold.start = best.map_or(self.threshold.start, |(_, w)| w as f32);
     }
 }
 
@@ -203,11 +202,7 @@ impl<W: Arena> Players<W> for IqnPlayers<W> {
         let mut tensors = self.network.tensors(PLAYER);
         let Threshold { start, running } = self.threshold;
         if self.own.risk == Risk::Static {
-            tensors.push((
-                format!("{PLAYER}.threshold"),
-                vec![2],
-                vec![start as f32, running as f32],
-            ));
+            tensors.push((format!("{PLAYER}.threshold"), vec![2], vec![start, running]));
         }
         weights::tensors_to_bytes(tensors, about)
     }
@@ -216,7 +211,7 @@ impl<W: Arena> Players<W> for IqnPlayers<W> {
         let file = Weights::read(bytes)?;
         if self.own.risk == Risk::Static {
             let numbers = file.numbers(&format!("{PLAYER}.threshold"), &[2])?;
-            let [start, running] = [0, 1].map(|at| f64::from(numbers[at]));
+            let [start, running] = [numbers[0], numbers[1]];
             if !(start.is_finite() && running.is_finite()) {
                 return Err(WeightsError::NotFinite { player: PLAYER, quantity: "the threshold" });
             }
@@ -266,7 +261,8 @@ impl<W: Arena> IqnPolicy<'_, W> {
         self.thresholds.clear();
         if players.own.risk == Risk::Static {
             self.thresholds.extend((0..world.episodes()).map(|slot| {
-                let start = self.starts.get(slot).copied().unwrap_or(players.threshold.start);
+                let start =
+                    self.starts.get(slot).copied().unwrap_or(players.threshold.start.into());
                 players.shown(players.threshold_at(start, world.time(slot)))
             }));
         }
@@ -387,7 +383,7 @@ impl<'a, W: Arena> IqnTraining<'a, W> {
         let terms = Terms { eta: Eta::NEUTRAL, mode: Mode::Sampled, exploring: turn.exploring };
         let mut policy = players.policy(exploration);
         if players.own.risk == Risk::Static {
-            let ([least, greatest], own) = (players.range, players.threshold.start);
+            let ([least, greatest], own) = (players.range, players.threshold.start.into());
             let slots = 0..setting.options.parallel_episodes;
             policy.starts.extend(slots.map(|slot| {
                 if slot % 2 == 0 { own } else { random.random_range(least..=greatest) }
@@ -404,7 +400,7 @@ impl<'a, W: Arena> IqnTraining<'a, W> {
                     players.observation.protagonist(&game.world, &mut next);
                     for (slot, step) in game.steps.iter().enumerate() {
                         if step.end.is_none() {
-                            running = step.reward;
+                            running = step.reward as f32;
                         }
                         replay.add(Transition {
                             seen: policy.inputs.rows().row(slot, width),
@@ -424,16 +420,16 @@ impl<'a, W: Arena> IqnTraining<'a, W> {
     /// A gradient step; the loss and the norm of its gradient.
     fn learn(&mut self) -> [f64; 2] {
         let Self { players, target, replay, random, minibatch, gradient, setting, .. } = self;
-        let own = players.own.clone();
+        let own = players.own;
         let n = own.minibatch;
         replay.gather((0..n).map(|_| random.random_range(0..replay.len())), minibatch);
         let [mut shown, mut later] = [(); 2].map(|()| Vec::new());
         if players.own.risk == Risk::Static {
             let [least, greatest] = players.range;
-            for (reward, _) in minibatch.rewards.iter().zip(0..n) {
+            for &reward in &minibatch.rewards {
                 let threshold = random.random_range(least..=greatest);
                 shown.push(players.shown(threshold));
-                later.push(players.shown((threshold - f64::from(*reward)) / setting.gamma));
+                later.push(players.shown((threshold - f64::from(reward)) / setting.gamma));
             }
         }
         let alpha = players.alpha;
@@ -507,7 +503,7 @@ impl<W: Arena> Training<W> for IqnTraining<'_, W> {
         self.done += 1;
         let [loss, norm] = sums.map(|sum| sum / (self.gradient_steps - first) as f64);
         let static_risk = self.players.own.risk == Risk::Static;
-        let threshold = if static_risk { self.players.threshold.start } else { f64::NAN };
+        let threshold = if static_risk { self.players.threshold.start.into() } else { f64::NAN };
         let collector = &self.collector;
         let mean_return = collector.mean_return();
         let values = vec![
@@ -521,8 +517,8 @@ impl<W: Arena> Training<W> for IqnTraining<'_, W> {
             loss,
             norm,
         ];
-        let (steps, player) = (self.steps(), Role::Protagonist.name());
-        Ok(Some(Progress { update: turn.update, steps, player, mean_return, values }))
+        let (update, steps, player) = (turn.update, self.steps(), PLAYER);
+        Ok(Some(Progress { update, steps, player, mean_return, values }))
     }
 
     fn updates(&self) -> u64 {
