@@ -168,8 +168,14 @@ fn bad_values_are_refused_with_key_value_and_range() {
         ("train.hide_budget=1", ["train.hide_budget = 1", "true or false"]),
         ("train.budget_wait=1", ["train.budget_wait = 1", "at least 0 and below 1"]),
         ("train.credit=executed", ["in which chance decides an action", "(lava-point)"]),
-        ("train.family.kind=softmax", ["use \"bumps\" or \"probits\" or \"auto\"", "(lava-point)"]),
-        ("train.family.kind=none", ["\"none\"", "\"auto\", \"bumps\", \"probits\" or \"softmax\""]),
+        (
+            "train.family.kind=softmax",
+            ["use \"bumps\" or \"probits\" or \"shift\" or \"auto\"", "(lava-point)"],
+        ),
+        (
+            "train.family.kind=none",
+            ["\"none\"", "\"auto\", \"bumps\", \"probits\", \"shift\" or \"softmax\""],
+        ),
         ("experiment.methods=[\"dqn\"]", ["dqn", "each element \"game\""]),
         (
             "train.family=4",

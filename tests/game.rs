@@ -1,7 +1,7 @@
 //! The game against independent truth: quadrature, finite differences, and trajectories in both
 //! worlds.
 
-use approx::assert_relative_eq;
+use approx::{assert_abs_diff_eq, assert_relative_eq};
 use cvar_game::game::budget::{Budget, Eta};
 use cvar_game::game::bump::Bump;
 use cvar_game::game::columns::SAMPLES;
@@ -9,6 +9,7 @@ use cvar_game::game::finite::FiniteFamily;
 use cvar_game::game::gaussian::{Component, GaussianFamily, GaussianPerturbation, MOST};
 use cvar_game::game::perturbation::{Draws, Family, Perturbation};
 use cvar_game::game::probit::Probit;
+use cvar_game::game::shift::Shift;
 use lava_envs::{FiniteLaw, GaussianLaw, Law};
 use nalgebra::{Matrix2, Vector2};
 use proptest::prelude::*;
@@ -418,6 +419,64 @@ fn extreme_probits_stay_finite() {
             }
         }
     }
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig::with_cases(100))]
+
+    /// A shift is the normal law that it says it is, within its relative entropy, by quadrature; its score is that of
+    /// finite differences.
+    #[test]
+    fn shifts_are_forces_within_a_relative_entropy(
+        parameters in prop::array::uniform2(-5.0f64..5.0),
+        eta in 1.0f64..8.0,
+        xi in prop::array::uniform2(-3.0f64..3.0),
+    ) {
+        let shift = |z: &[f64]| Shift.perturbation(z, &GaussianLaw, budget(eta));
+        let of = shift(&parameters);
+        let perturbed = |xi: Vector2<f64>| GaussianLaw.log_density(xi).exp() * of.likelihood_ratio(xi);
+        let mean = of.mean();
+        let integral = |f: &dyn Fn(Vector2<f64>) -> f64| {
+            integrate(|xi| f(xi) * perturbed(xi), mean, 8.0, 200)
+        };
+        assert_abs_diff_eq!(integral(&|_| 1.0), 1.0, epsilon = 1e-9);
+        assert_abs_diff_eq!(integral(&|xi| xi.x), mean.x, epsilon = 1e-9);
+        assert_abs_diff_eq!(integral(&|xi| xi.y), mean.y, epsilon = 1e-9);
+        let relative_entropy = integral(&|xi| of.likelihood_ratio(xi).ln());
+        prop_assert!(relative_entropy <= eta.ln() + 1e-9);
+        let far = Shift.perturbation(&[parameters[0] * 1e6, parameters[1] * 1e6], &GaussianLaw, budget(eta));
+        if parameters[0] != 0.0 {
+            assert_abs_diff_eq!(0.5 * far.mean().norm_squared(), eta.ln(), epsilon = 1e-6);
+        }
+        let entropy = -integral(&|xi| perturbed(xi).max(f64::MIN_POSITIVE).ln());
+        let mut gradient = [0.0; 2];
+        assert_abs_diff_eq!(of.entropy(&mut gradient), entropy, epsilon = 1e-6);
+        prop_assert_eq!(gradient, [0.0; 2]);
+
+        let xi = Vector2::from(xi);
+        let ratio = of.score(xi, &mut gradient);
+        assert_relative_eq!(ratio, of.likelihood_ratio(xi), epsilon = 1e-12);
+        let log = |z: &[f64]| shift(z).likelihood_ratio(xi).ln();
+        assert_gradient(&gradient, &differences(log, &parameters));
+    }
+}
+
+/// Draws of a shift have its mean and unit variance.
+#[test]
+fn draws_follow_their_shift() {
+    let shift = Shift.perturbation(&[-1.0, 2.0], &GaussianLaw, budget(2.0));
+    let mut random = ChaCha8Rng::seed_from_u64(7);
+    let n = 400_000;
+    let (mut first, mut second) = (Vector2::zeros(), Vector2::zeros());
+    for _ in 0..n {
+        let from_mean = shift.sample(&mut random) - shift.mean();
+        first += from_mean / f64::from(n);
+        second += from_mean.component_mul(&from_mean) / f64::from(n);
+    }
+    assert!(
+        first.norm() < 0.01 && (second - Vector2::new(1.0, 1.0)).norm() < 0.015,
+        "{first} {second}"
+    );
 }
 
 /// Draws follow the density: moments against quadrature. Steep and mild steps, likely and rare ones.

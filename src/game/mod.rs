@@ -9,4 +9,5 @@ pub mod normal;
 pub mod perturbation;
 pub mod probit;
 pub mod returns;
+pub mod shift;
 pub mod squashed;

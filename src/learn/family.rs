@@ -23,6 +23,7 @@ use crate::game::finite::FiniteFamily;
 use crate::game::gaussian::GaussianFamily;
 use crate::game::perturbation::{Draws, Family, Perturbation};
 use crate::game::probit::Probit;
+use crate::game::shift::Shift;
 use lava_envs::random::ChaCha8Rng;
 use lava_envs::{FiniteLaw, GaussianLaw, Law};
 use rand::RngExt;
@@ -44,8 +45,11 @@ impl<const N: usize> Perturbed for FiniteLaw<N> {
 }
 
 impl Perturbed for GaussianLaw {
-    const FAMILIES: &'static [FamilyEntry<Self>] =
-        &[FamilyEntry::of::<GaussianFamily<Bump>>(), FamilyEntry::of::<GaussianFamily<Probit>>()];
+    const FAMILIES: &'static [FamilyEntry<Self>] = &[
+        FamilyEntry::of::<GaussianFamily<Bump>>(),
+        FamilyEntry::of::<GaussianFamily<Probit>>(),
+        FamilyEntry::of::<Shift>(),
+    ];
 }
 
 /// A family that can be chosen by its name.
@@ -53,6 +57,7 @@ impl Perturbed for GaussianLaw {
 pub struct FamilyEntry<L: Law> {
     /// `train.family.kind`.
     pub kind: &'static str,
+    within_budget: bool,
     antagonist: fn(&FamilyOptions, Sizes<'_>) -> Box<dyn Antagonist<L>>,
 }
 
@@ -75,6 +80,10 @@ struct Sizes<'a> {
 pub trait Named: Family + 'static {
     /// `train.family.kind`.
     const KIND: &'static str;
+
+    /// Whether its likelihood ratios are within a budget. One without can only be bounded in every step, in a sense of
+    /// its own.
+    const WITHIN_BUDGET: bool = true;
 
     /// The family with these options.
     fn with(options: &FamilyOptions) -> Self;
@@ -104,6 +113,15 @@ impl Named for GaussianFamily<Probit> {
     }
 }
 
+impl Named for Shift {
+    const KIND: &'static str = "shift";
+    const WITHIN_BUDGET: bool = false;
+
+    fn with(_: &FamilyOptions) -> Self {
+        Shift
+    }
+}
+
 fn gaussian<C>(options: &FamilyOptions) -> GaussianFamily<C> {
     GaussianFamily::new(options.count, options.center, options.curvature)
 }
@@ -112,6 +130,7 @@ impl<L: Law> FamilyEntry<L> {
     const fn of<F: Named<Law = L>>() -> Self {
         FamilyEntry {
             kind: F::KIND,
+            within_budget: F::WITHIN_BUDGET,
             antagonist: |options, Sizes { columns, hidden, device, random }| {
                 let head = AntagonistHead(F::with(options));
                 Box::new(Player::new(head, columns, hidden, device, random))
@@ -135,6 +154,24 @@ pub fn family<L: Perturbed>(options: &FamilyOptions) -> Result<&'static FamilyEn
             kinds.join(" or ")
         )
     })
+}
+
+/// [`family`], which must keep a budget.
+///
+/// # Errors
+/// As [`family`], and if its likelihood ratios are not bounded.
+pub fn family_within_budget<L: Perturbed>(
+    options: &FamilyOptions,
+) -> Result<&'static FamilyEntry<L>, String> {
+    let found = family::<L>(options)?;
+    if !found.within_budget {
+        let (kind, default) = (found.kind, L::FAMILIES[0].kind);
+        return Err(format!(
+            "train.family.kind = {kind:?} has likelihood ratios without a bound, for which no budget can pay; \
+             use {default:?}, or the method `rarl`"
+        ));
+    }
+    Ok(found)
 }
 
 /// A fresh antagonist that sees samples of these sizes.

@@ -34,7 +34,7 @@ impl<W: Playable> Adversary<W> {
     /// # Errors
     /// If the family does not fit the world.
     pub fn played(options: &FamilyOptions) -> Result<Self, String> {
-        family::family::<W::Law>(options)?;
+        family::family_within_budget::<W::Law>(options)?;
         // Its networks are never asked.
         let columns = Columns { cells: 0, numbers: 1, critic_only: 0 };
         let random = &mut stream(0, Purpose::AntagonistWeights, 0);

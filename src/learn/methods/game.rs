@@ -68,7 +68,7 @@ impl Method for Game {
             }
         }
         <W::Action as Action>::Kind::check(options)?;
-        family::family::<W::Law>(&options.family).map(|_| ())
+        family::family_within_budget::<W::Law>(&options.family).map(|_| ())
     }
 
     fn check_schedule(options: &TrainOptions, eta: Eta) -> Result<(), String> {

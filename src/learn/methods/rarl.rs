@@ -5,14 +5,18 @@
 //! sup_o delta_t(o) <= strength    for every t.
 //! ```
 //!
+//! With `train.family.kind = "shift"` it is the published bounded force, where the noise is Gaussian: it moves the mean, and
+//! log strength bounds the relative entropy of each step (`crate::game::shift`).
+//!
 //! It is the rival that the paper argues against: a bound for each step has no risk level, and its strength must be
 //! found by trial. Players are updated in turn, and `train.budget_wait` and `train.budget_rise` are a schedule of the
 //! strength. What the adversary could do within the game's budget is unknown; only its protagonist is judged.
 
 use super::game::{Game, GameTraining};
 use crate::game::budget::Eta;
+use crate::learn::family;
 use crate::learn::method::{Arena, Method, Metric, Players, Setting, Training};
-use crate::learn::options::{Acts, Adversary, TrainOptions};
+use crate::learn::options::{Acts, Adversary, FamilyOptions, TrainOptions};
 use crate::learn::pair::Pair;
 use crate::learn::vector_game::Spending;
 
@@ -33,7 +37,8 @@ impl Method for Rarl {
     const NAME: &'static str = "rarl";
     const METRICS: &'static [Metric] = Game::METRICS;
     const DEFAULTS: &'static str = "\
-# The most by which the adversary may multiply the probability of an outcome in each step.
+# The most by which the adversary may multiply the probability of an outcome in each step; with train.family.kind =
+# \"shift\", a force, it is the exponential of the most relative entropy in nats.
 # Range: [1, 1000000]
 strength = 1.5
 ";
@@ -46,7 +51,11 @@ strength = 1.5
                     .to_owned(),
             );
         }
-        Game::check::<W>(options, own)
+        // Its adversary has no budget to keep.
+        family::family::<W::Law>(&options.family)?;
+        let default = FamilyOptions { kind: "auto".to_owned(), ..options.family.clone() };
+        let options = TrainOptions { family: default, ..options.clone() };
+        Game::check::<W>(&options, own)
     }
 
     fn check_schedule(options: &TrainOptions, eta: Eta) -> Result<(), String> {
