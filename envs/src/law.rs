@@ -32,7 +32,16 @@ impl<const N: usize> Law for FiniteLaw<N> {
     type Outcome = usize;
 
     fn sample<R: Rng>(&self, random: &mut R) -> usize {
-        sample_index(&self.probabilities, random)
+        // `sample_index` without branches: which outcome it is cannot be foreseen.
+        let mut rest: f64 = random.random();
+        let (mut chosen, mut found) = (0, false);
+        for (index, &probability) in self.probabilities.iter().enumerate() {
+            let open = (probability > 0.0) & !found;
+            chosen = if open { index } else { chosen };
+            found |= open & (rest < probability);
+            rest -= probability;
+        }
+        chosen
     }
 
     fn log_density(&self, outcome: usize) -> f64 {
@@ -74,5 +83,32 @@ impl Law for GaussianLaw {
 
     fn log_density(&self, outcome: Vector2<f64>) -> f64 {
         -0.5 * outcome.norm_squared() - (2.0 * std::f64::consts::PI).ln()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::random::{Purpose, stream};
+
+    /// With and without branches the same outcome is drawn, of laws with impossible outcomes and such whose
+    /// probabilities do not add up to 1.
+    #[test]
+    fn laws_draw_as_lists_of_probabilities() {
+        let random = &mut stream(7, Purpose::Actions, 0);
+        for round in 0..100_000_u64 {
+            let mut probabilities: [f64; 4] = std::array::from_fn(|_| random.random());
+            probabilities.iter_mut().for_each(|p| *p *= f64::from(random.random_bool(0.7)));
+            let sum: f64 = probabilities.iter().sum();
+            let sum = if round % 3 == 0 { sum * 2.0 } else { sum };
+            if sum == 0.0 {
+                continue;
+            }
+            let law = FiniteLaw { probabilities: probabilities.map(|p| p / sum) };
+            let of = |index| stream(8, Purpose::Actions, index);
+            let drawn = law.sample(&mut of(round));
+            assert_eq!(drawn, sample_index(&law.probabilities, &mut of(round)), "{law:?}");
+            assert!(law.probabilities[drawn] > 0.0);
+        }
     }
 }

@@ -4,7 +4,7 @@
 use crate::game::budget::{Budget, Mixing};
 use crate::game::columns::{self, Column, Loops, SAMPLES, exp, ln};
 use crate::game::perturbation::{Block, Draws, Family, Perturbation};
-use lava_envs::law::{FiniteLaw, sample_index};
+use lava_envs::law::{FiniteLaw, Law};
 use rand::Rng;
 
 /// The finite family over `N` outcomes; its parameters are the logits, shape `[N]`.
@@ -73,8 +73,8 @@ impl<const N: usize> Family for FiniteFamily<N> {
         });
         for (i, random) in random.iter_mut().enumerate() {
             let own: [f64; N] = std::array::from_fn(|k| probabilities[k][i]);
-            let drawn_from = if nominal { &laws[i].probabilities } else { &own };
-            let outcome = sample_index(drawn_from, random);
+            let drawn_from = if nominal { laws[i].probabilities } else { own };
+            let outcome = FiniteLaw { probabilities: drawn_from }.sample(random);
             outcomes.push(outcome);
             ratios[i] = all[outcome][i];
         }
@@ -269,7 +269,7 @@ impl<const N: usize> Perturbation for FinitePerturbation<N> {
     }
 
     fn sample<R: Rng>(&self, random: &mut R) -> usize {
-        sample_index(&self.perturbed, random)
+        FiniteLaw { probabilities: self.perturbed }.sample(random)
     }
 
     fn score(&self, outcome: usize, gradient: &mut [f64]) -> f64 {

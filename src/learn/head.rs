@@ -13,7 +13,7 @@ use crate::game::normal::LOG_2_PI;
 use crate::game::perturbation::{self, Family, Perturbation};
 use lava_envs::Force;
 use lava_envs::action::{Action, ActionKind, Discrete, Finite};
-use lava_envs::law::{FiniteLaw, GaussianLaw, Law, sample_index};
+use lava_envs::law::{FiniteLaw, GaussianLaw, Law};
 use nalgebra::Vector2;
 use rand::Rng;
 use smallvec::SmallVec;
@@ -412,7 +412,7 @@ impl<A: Discrete, const N: usize> PolicyHead for CategoricalPolicy<A, N> {
             }
             Mode::Sampled => {
                 let own: [f64; N] = std::array::from_fn(|action| probabilities[action][i]);
-                A::from_index(sample_index(&own, random))
+                A::from_index(FiniteLaw { probabilities: own }.sample(random))
             }
         }));
     }

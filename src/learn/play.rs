@@ -8,7 +8,7 @@ use super::policy::{Draw, Mode, Opponent, Policy, Streams};
 use super::vector_game::VectorGame;
 use crate::game::budget::Eta;
 use crate::game::returns::{Atom, ReturnLaw, ReturnSoFar};
-use lava_envs::random::{Purpose, stream};
+use lava_envs::random::{Purpose, restart, stream};
 use lava_envs::{End, World};
 
 /// How episodes are played.
@@ -154,7 +154,9 @@ pub fn play<W: World>(
                 next += 1;
                 if episode.index < episodes {
                     game.start(slot, play.eta);
-                    game.streams[slot] = play.streams(episode.index as u64);
+                    let Streams { actions, outcomes } = &mut game.streams[slot];
+                    restart(actions, Purpose::EvaluationActions, episode.index as u64);
+                    restart(outcomes, Purpose::EvaluationOutcomes, episode.index as u64);
                 } else {
                     game.idle[slot] = true;
                 }

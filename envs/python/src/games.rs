@@ -11,7 +11,7 @@ use cvar_game::learn::observation::Observation;
 use cvar_game::learn::options::View;
 use cvar_game::learn::policy::{Draw, Mode, Policy, Situation, Streams};
 use cvar_game::learn::vector_game::VectorGame;
-use lava_envs::random::{Purpose, position, stream, stream_from};
+use lava_envs::random::{Purpose, position, restart, stream, stream_from};
 use lava_envs::{End, World};
 use serde::{Deserialize, Serialize};
 
@@ -237,16 +237,19 @@ impl<W: Playable> Games<W> {
         Ok(games)
     }
 
-    fn start(&mut self, slot: usize) {
-        let (seed, episode) = self.episodes[slot];
+    fn start(&mut self, slot: usize, seed: u64) {
+        self.episodes[slot] = (seed, 0);
         self.game.start(slot, self.eta);
-        self.game.streams[slot].outcomes = stream(seed, Purpose::EvaluationOutcomes, episode);
+        self.game.streams[slot].outcomes = stream(seed, Purpose::EvaluationOutcomes, 0);
         self.over[slot] = false;
     }
 
     fn start_next(&mut self, slot: usize) {
-        self.episodes[slot].1 += 1;
-        self.start(slot);
+        let (_, episode) = &mut self.episodes[slot];
+        *episode += 1;
+        self.game.start(slot, self.eta);
+        restart(&mut self.game.streams[slot].outcomes, Purpose::EvaluationOutcomes, *episode);
+        self.over[slot] = false;
     }
 }
 
@@ -321,10 +324,7 @@ impl<W: Playable> AnyGames for Games<W> {
     fn reset(&mut self, slots: &[usize], seeds: Option<&[u64]>) {
         for (i, &slot) in slots.iter().enumerate() {
             match seeds {
-                Some(seeds) => {
-                    self.episodes[slot] = (seeds[i], 0);
-                    self.start(slot);
-                }
+                Some(seeds) => self.start(slot, seeds[i]),
                 None => self.start_next(slot),
             }
         }

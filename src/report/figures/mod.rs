@@ -140,6 +140,10 @@ impl Figures {
         if profile.is_some() {
             add("profile", "performance profile", profile);
         }
+        let improvement = curves::improvement(panels);
+        if improvement.is_some() {
+            add("improvement", "probability of improvement", improvement);
+        }
         add("cross", "every policy at every level", curves::cross(panels));
         add("learning", "learning curves", curves::learning(panels));
         add("budget", "the budget over time", curves::budget(panels));
