@@ -7,8 +7,8 @@ use cvar_game::game::budget::Eta;
 use cvar_game::game::returns::ReturnLaw;
 use cvar_game::learn::device::Device;
 use cvar_game::learn::method::{Arena, Method, Setting};
-use cvar_game::learn::methods::{Augmented, CvarPg, Neutral, Rarl, ReturnCapping};
-use cvar_game::learn::options::{PlaneLaw, TrainOptions};
+use cvar_game::learn::methods::{Augmented, CvarPg, Game, Neutral, Rarl, ReturnCapping};
+use cvar_game::learn::options::{FamilyOptions, PlaneLaw, TrainOptions};
 use cvar_game::learn::play::{Play, play};
 use cvar_game::learn::policy::{Draw, Mode, Nominal};
 use fork::fork;
@@ -111,6 +111,26 @@ fn every_method_finds_its_optimum_of_the_gaussian_stake() {
         check_stake::<Rarl>(eta, &format!("strength = {eta:.1}"), alpha);
         check_stake::<Rarl>(eta, "strength = 1.0", 1.0);
     }
+}
+
+/// A force may take `R = sqrt(2 log strength)` deviations from the gain. The best stake is then `mean - deviation R`, and
+/// its mean under nominal chance is `mean stake - stake^2 / 2`.
+#[test]
+fn a_force_is_met_by_the_stake_that_it_leaves() {
+    let options = TrainOptions {
+        family: FamilyOptions { kind: "shift".to_owned(), ..options().family },
+        ..options()
+    };
+    for strength in [1.3_f64, 3.0] {
+        let stake = GAIN.mean - GAIN.deviation * (2.0 * strength.ln()).sqrt();
+        let best = GAIN.mean * stake - 0.5 * stake * stake;
+        let world = |slots| Stake::new(&GAIN, slots).unwrap();
+        let own = format!("strength = {strength:.1}");
+        let mean = trained::<Rarl, _>(world, &options, (2.0, 1), &own).mean();
+        assert!((mean - best).abs() < 0.01, "{strength}: {mean}, not {best}");
+    }
+    let refused = Game::check::<Stake>(&options, &toml::Table::new()).unwrap_err();
+    assert!(refused.contains("rarl"), "{refused}");
 }
 
 #[test]

@@ -58,6 +58,7 @@ pub struct Stepped {
 }
 
 /// What is told of a step.
+#[derive(Clone)]
 pub struct More {
     /// How the episode has ended: 0 not yet, 1 goal, 2 lava, 3 time limit.
     pub end: Vec<i64>,
@@ -72,31 +73,18 @@ pub struct More {
 }
 
 impl More {
-    /// Those of the slots that are to be kept, with 0 in the others.
-    fn only(&self, keep: impl Fn(usize) -> bool + Copy) -> More {
-        fn kept<T: Copy + Default>(
-            numbers: &[T],
-            width: usize,
-            keep: impl Fn(usize) -> bool,
-        ) -> Vec<T> {
-            let mut kept = numbers.to_vec();
-            for (slot, row) in kept.chunks_exact_mut(width).enumerate() {
-                if !keep(slot) {
-                    row.fill(T::default());
-                }
-            }
-            kept
-        }
-        let values = |of: &Values| match of {
-            Values::Indices(indices) => Values::Indices(kept(indices, 1, keep)),
-            Values::Rows(rows, width) => Values::Rows(kept(rows, *width, keep), *width),
+    /// Puts 0 into the slots that are not to be kept.
+    fn keep(&mut self, keep: impl Fn(usize) -> bool) {
+        let values = |of: &mut Values, slot: usize| match of {
+            Values::Indices(indices) => indices[slot] = 0,
+            Values::Rows(rows, width) => rows[slot * *width..][..*width].fill(0.0),
         };
-        More {
-            end: kept(&self.end, 1, keep),
-            outcome: values(&self.outcome),
-            nominal: self.nominal.as_ref().map(values),
-            ratio: kept(&self.ratio, 1, keep),
-            budget: kept(&self.budget, 1, keep),
+        for slot in (0..self.end.len()).filter(|&slot| !keep(slot)) {
+            self.end[slot] = 0;
+            values(&mut self.outcome, slot);
+            self.nominal.iter_mut().for_each(|nominal| values(nominal, slot));
+            self.ratio[slot] = 0.0;
+            self.budget[slot] = 0.0;
         }
     }
 }
@@ -414,10 +402,11 @@ impl<W: Playable> AnyGames for Games<W> {
                     .filter(|(_, ends)| !**ends)
                     .for_each(|(of, _)| *of = 0.0);
                 let observation = self.observe();
-                let more = more.as_ref().map(|more| more.only(|slot| began[slot]));
+                let mut more = more.clone();
+                more.iter_mut().for_each(|more| more.keep(|slot| began[slot]));
                 last = Some(Last { observation, clearance, more });
             }
-            more = more.map(|more| more.only(|slot| !began[slot]));
+            more.iter_mut().for_each(|more| more.keep(|slot| !began[slot]));
             for slot in (0..began.len()).filter(|&slot| began[slot]) {
                 self.start_next(slot);
             }

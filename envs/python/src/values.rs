@@ -14,6 +14,7 @@ use numpy::{
 use pyo3::prelude::*;
 
 /// Values of a batch.
+#[derive(Clone)]
 pub enum Values {
     /// Indices, shape `[slots]`.
     Indices(Vec<i64>),
