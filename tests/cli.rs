@@ -98,6 +98,15 @@ fn bad_input_is_refused_in_one_line_that_says_what_to_do() {
         (train(&["1", "--set", "steps"]), ["--set steps", "--set key=value"]),
         (bench(&["--set", "gamma=nan"]), ["gamma = nan (from --set)", "at most 1"]),
         (bench(&["--set", "experiment.seeds=[1,1]"]), ["experiment.seeds", "duplicates"]),
+        (
+            bench(&["--set", "experiment.shifts=['lava-grid.slap=0.1']"]),
+            ["env.lava-grid.slap", "did you mean env.lava-grid.slip?"],
+        ),
+        (
+            bench(&["--set", "experiment.shifts=['lava-grid.slip=2']"]),
+            ["env.lava-grid.slip = 2", "at most 1"],
+        ),
+        (bench(&["--set", "experiment.shifts=['slip']"]), ["\"slip\"", "WORLD.CONSTANT=VALUE"]),
         (bench(&["--set", "env.map=..G"]), ["env.lava-grid.map", "write S into one free cell"]),
         (bench(&["--set", "env.map=S.."]), ["env.lava-grid.map", "write G into a free cell"]),
         (
@@ -429,11 +438,25 @@ mod runs {
         let folder = tempfile::tempdir().unwrap();
         let config = config_file(&folder, SMALL);
         let out = folder.path().join("out");
-        let text = answer(&["bench", "--config", &config, "--out", out.to_str().unwrap()]);
+        let shifts = "experiment.shifts=['lava-grid.slip=0.05,0.2']";
+        let out_path = out.to_str().unwrap();
+        let text = answer(&["bench", "--config", &config, "--out", out_path, "--set", shifts]);
         assert!(text.contains("lava-grid") && text.contains("lava-point"), "{text}");
         for file in ["runs.csv", "table.csv", "table.md"] {
             assert!(out.join(file).exists(), "{file} is missing");
         }
+        // Under the slip of training every policy is worth what it was, under another one something else.
+        let runs = fs::read_to_string(out.join("runs.csv")).unwrap();
+        let shifted = fs::read_to_string(out.join("shifts.csv")).unwrap();
+        let of = |slip: &str| -> Vec<String> {
+            let (slips, means) = (column(&shifted, "value"), column(&shifted, "mean"));
+            slips.iter().zip(means).filter(|(of, _)| *of == slip).map(|(_, mean)| mean).collect()
+        };
+        let worlds = column(&runs, "env").into_iter().zip(column(&runs, "greedy_mean"));
+        let trained: Vec<String> =
+            worlds.filter(|(world, _)| world == "lava-grid").map(|(_, mean)| mean).collect();
+        assert_eq!(of("0.05"), trained);
+        assert!(of("0.2").len() == trained.len() && of("0.2") != trained);
         assert_eq!(answer(&["table", out.to_str().unwrap()]), text);
         let run = out.join("lava-grid/game/eta-25/seed-1");
         for antagonist in ["nominal", "learned", "exact"] {

@@ -173,22 +173,33 @@ mod iqn {
         trained::<Iqn, _>(|slots| fork(safe, slots), &options(), (eta, seed), &own(risk)).cvar(0.5)
     }
 
+    #[track_caller]
+    fn check_fork(seed: u64) {
+        for risk in ["iterated", "static"] {
+            let cvar = learned(0.5, 2.0, seed, risk);
+            assert!((cvar - PASSES).abs() < 0.01, "{risk}, seed {seed}: {cvar}");
+            let cvar = learned(0.5, 1.0, seed, risk);
+            assert!((cvar - GAMBLES).abs() < 0.01, "{risk} at eta = 1, seed {seed}: {cvar}");
+        }
+    }
+
     #[test]
     fn both_policies_find_the_optimum_of_the_fork() {
-        for seed in 1..=3 {
-            for risk in ["iterated", "static"] {
-                let cvar = learned(0.5, 2.0, seed, risk);
-                assert!((cvar - PASSES).abs() < 0.01, "{risk}, seed {seed}: {cvar}");
-                let cvar = learned(0.5, 1.0, seed, risk);
-                assert!((cvar - GAMBLES).abs() < 0.01, "{risk} at eta = 1, seed {seed}: {cvar}");
-            }
-        }
+        check_fork(1);
+    }
+
+    #[test]
+    #[ignore = "takes a minute"]
+    fn both_policies_find_the_optimum_of_the_fork_with_other_seeds() {
+        check_fork(2);
+        check_fork(3);
     }
 
     /// What the published policy optimises is iterated (Lim & Malik 2022). Where s2 pays 2, the worst half of the return
     /// is all of s1, in which gambling has the better mean: CVaR_0.5 is 0.25 by gambling, 0 by passing. The CVaR that is
     /// taken anew in s1 is -1 by gambling.
     #[test]
+    #[ignore = "takes a minute"]
     fn iterated_cvar_is_not_the_cvar_of_the_return() {
         for seed in 1..=3 {
             let iterated = learned(2.0, 2.0, seed, "iterated");
@@ -199,6 +210,7 @@ mod iqn {
     }
 
     #[test]
+    #[ignore = "takes a minute"]
     fn both_policies_find_the_best_push_of_the_gaussian_stake() {
         for (eta, risk) in [(1.0, "iterated"), (5.0, "iterated"), (5.0, "static")] {
             let alpha = 1.0 / eta;

@@ -1,6 +1,7 @@
 //! The arguments of the command line.
 
 use crate::experiment::artefacts::Chance;
+use crate::experiment::config::Shift;
 use crate::experiment::config::{
     BYTES_OF_AN_EPISODE, Catalogue, Config, ConfigError, MOST_EPISODES, Setting, Source,
 };
@@ -8,7 +9,6 @@ use crate::experiment::names::{MethodName, RunId, WorldName};
 use crate::experiment::steps::Format;
 use crate::learn::device::Device;
 use crate::learn::policy::Mode;
-use crate::report::shifts::Shift;
 use clap::{Args, Parser, Subcommand};
 use std::num::NonZeroUsize;
 use std::path::PathBuf;

@@ -11,7 +11,7 @@ use crate::exact::yardstick;
 use crate::experiment::archive;
 use crate::experiment::artefacts::Chance;
 use crate::experiment::config::catalogue::annotated_constants;
-use crate::experiment::config::{Config, RunConfig, Setting, Source, WorldConstants};
+use crate::experiment::config::{Config, RunConfig, Setting, Shift, Source, WorldConstants};
 use crate::experiment::evaluation;
 use crate::experiment::failure::RunError;
 use crate::experiment::names::{MethodName, RunId, WorldName};
@@ -105,6 +105,12 @@ fn bench(registry: &Registry, args: &BenchArgs, program: PathBuf, stop: &Stop) -
         };
         print(&written?.terminal(report::screen_width()))?;
         note(format!("written to {}", out.display()));
+        let shifts = &config.experiment.shifts;
+        if !shifts.is_empty() {
+            let judged = stop.interruptible(|| judge_shifted(registry, &out, shifts, None));
+            let Some(judged) = judged else { return Ok(report_end(&stopped(stop))) };
+            judged?;
+        }
     }
     Ok(code)
 }
@@ -429,14 +435,25 @@ fn man(args: &ManArgs) -> Result<ExitCode> {
 fn shifts(registry: &Registry, args: &ShiftsArgs) -> Result<ExitCode> {
     let usual = || report::shifts::USUAL.map(|text| text.parse().expect("it is a shift")).to_vec();
     let shifts = if args.to.is_empty() { usual() } else { args.to.clone() };
+    judge_shifted(registry, &args.folder, &shifts, args.episodes)?;
+    Ok(ExitCode::SUCCESS)
+}
+
+/// Judges the policies of a folder under other constants than those of their training.
+fn judge_shifted(
+    registry: &Registry,
+    dir: &Path,
+    shifts: &[Shift],
+    episodes: Option<u64>,
+) -> Result<()> {
     let judge = |run: &report::runs::Run, constants: &toml::Table| {
-        let folder = args.folder.join(&run.files.path);
+        let folder = dir.join(&run.files.path);
         let config = read_run(registry, &folder).map_err(|error| error.to_string())?;
         let world = config.env.world.clone();
         let constants = WorldConstants { world, table: constants.clone() };
         let request = Request {
             chance: Chance::Nominal,
-            episodes: args.episodes,
+            episodes,
             seed: None,
             constants: Some(&constants),
             progress: &|| (),
@@ -445,13 +462,13 @@ fn shifts(registry: &Registry, args: &ShiftsArgs) -> Result<ExitCode> {
             registry.world(&config.env).and_then(|of| of.greedy_law(&config, &folder, &request));
         law.map_err(|error| error.to_string())
     };
-    let all = report::shifts::count(&args.folder, &shifts, registry)? as u64;
+    let all = report::shifts::count(dir, shifts, registry)? as u64;
     let meter = Counter::new(Meter::new("policies", all));
-    let notes = report::shifts::write(&args.folder, &shifts, registry, &judge, &|| meter.count());
+    let notes = report::shifts::write(dir, shifts, registry, &judge, &|| meter.count());
     meter.finish();
     notes?.into_iter().for_each(note);
-    note(format!("written to {}", args.folder.join("shifts.csv").display()));
-    Ok(ExitCode::SUCCESS)
+    note(format!("written to {}", dir.join("shifts.csv").display()));
+    Ok(())
 }
 
 fn pack(args: &PackArgs) -> Result<ExitCode> {

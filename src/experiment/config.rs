@@ -21,6 +21,7 @@
 //! | how is the annotated default read | `annotated`, `rules` |
 //! | which layer wins | `layers` |
 //! | what are variants and axes | `variants` |
+//! | what are shifts of constants | `shift` |
 //! | what does one run's `config.toml` hold, and how is it repeated | `run`, `constants`, `of_run` |
 
 mod annotated;
@@ -33,6 +34,7 @@ mod of_run;
 mod renamed;
 mod rules;
 mod run;
+mod shift;
 mod variants;
 
 use super::artefacts::SCHEMA;
@@ -54,6 +56,7 @@ pub use catalogue::{Catalogue, MethodInfo, WorldInfo};
 pub use constants::WorldConstants;
 pub use layers::Setting;
 pub use run::{Difference, RunConfig};
+pub use shift::Shift;
 
 /// What is wrong with a configuration, in one line.
 #[derive(Debug, Error)]
@@ -156,6 +159,8 @@ pub struct Experiment {
     pub etas: Vec<Eta>,
     /// Seeds, declared in advance.
     pub seeds: Vec<u64>,
+    /// Constants under which the policies are judged as well.
+    pub shifts: Vec<Shift>,
 }
 
 /// When unfinished runs are saved.
@@ -315,6 +320,7 @@ impl Config {
         let stack: Vec<Layer> = files.iter().cloned().chain(plain).collect();
         stack.iter().try_for_each(|layer| layer.check(schema))?;
         let experiment: Experiment = section(&layers::merged(&stack), "experiment")?;
+        experiment.shifts.iter().try_for_each(|shift| shift.check(schema))?;
         let drafts = variants::drafts(&stack, &experiment, settings, schema)?;
 
         let mut selected: Vec<WorldName> = drafts.iter().flat_map(|of| of.envs.clone()).collect();

@@ -4,21 +4,10 @@
 use super::figures::{self, Figure, Line};
 use super::runs::{Run, Runs, csv_text, number};
 use super::{Optimum, ReportError, Worlds, persist, persist_figure, statistics};
+use crate::experiment::config::Shift;
 use crate::game::returns::ReturnLaw;
 use lava_envs::End;
 use std::path::Path;
-use std::str::FromStr;
-
-/// Values of a constant of a world, of which each takes the place of that of training in turn.
-#[derive(Debug, Clone, PartialEq)]
-pub struct Shift {
-    /// Name of the world.
-    pub world: String,
-    /// Name of the constant.
-    pub constant: String,
-    /// Its values.
-    pub values: Vec<f64>,
-}
 
 /// What is judged unless something else is asked for.
 pub const USUAL: [&str; 4] = [
@@ -27,21 +16,6 @@ pub const USUAL: [&str; 4] = [
     "lava-point.acceleration=1.5,2,2.5,3,3.5",
     "lava-point.velocity_retention=0.3,0.4,0.5,0.6,0.7",
 ];
-
-impl FromStr for Shift {
-    type Err = String;
-
-    fn from_str(text: &str) -> Result<Self, String> {
-        let wrong =
-            || format!("{text:?} is no WORLD.CONSTANT=VALUE,VALUE.., such as {:?}", USUAL[0]);
-        let (key, values) = text.split_once('=').ok_or_else(wrong)?;
-        let (world, constant) = key.trim().split_once('.').ok_or_else(wrong)?;
-        let value = |text: &str| text.trim().parse().ok().filter(|value: &f64| value.is_finite());
-        let values: Option<Vec<f64>> = values.split(',').map(value).collect();
-        let values = values.ok_or_else(wrong)?;
-        Ok(Shift { world: world.to_owned(), constant: constant.to_owned(), values })
-    }
-}
 
 /// A run in a world with another constant.
 struct Judged<'a> {

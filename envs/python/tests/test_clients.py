@@ -126,3 +126,13 @@ def test_qrdqn_learns_to_reach_the_goal(monkeypatch: pytest.MonkeyPatch) -> None
     found = cvar_game.evaluate(sb3_qrdqn.table(model), "lava-grid", 1.0)
     assert found.goal > 0.9, str(found)
     assert found.regret is not None and found.regret < 0.1, str(found)
+
+
+@pytest.mark.slow
+def test_tqc_learns_to_reach_the_goal(monkeypatch: pytest.MonkeyPatch) -> None:
+    library("sb3_contrib")
+    sb3_tqc = example("sb3_tqc", monkeypatch)
+    model = sb3_tqc.train(seed=1)
+    found = cvar_game.evaluate(model, "lava-point", 1.0, episodes=10_000)
+    assert found.goal > 0.9, str(found)
+    assert found.mean > 0.2, str(found)
