@@ -30,6 +30,15 @@ fn refusal(arguments: &[&str]) -> String {
     error
 }
 
+/// A column of a CSV file.
+fn column(text: &str, name: &str) -> Vec<String> {
+    let mut reader = csv::Reader::from_reader(text.as_bytes());
+    let head = reader.headers().unwrap().clone();
+    let at = head.iter().position(|of| of == name);
+    let at = at.unwrap_or_else(|| panic!("there is no column {name} in {head:?}"));
+    reader.records().map(|row| row.unwrap()[at].to_owned()).collect()
+}
+
 fn config_file(folder: &TempDir, text: &str) -> String {
     let path = folder.path().join("some.toml");
     fs::write(&path, text).unwrap();
@@ -400,13 +409,6 @@ mod runs {
             std::process::Command::new("find").args([out, "-name", "progress.csv"]).output();
         let progress =
             std::path::PathBuf::from(String::from_utf8(found.unwrap().stdout).unwrap().trim());
-        let column = |text: &str, name: &str| -> Vec<String> {
-            let mut reader = csv::Reader::from_reader(text.as_bytes());
-            let head = reader.headers().unwrap().clone();
-            let at = head.iter().position(|of| of == name);
-            let at = at.unwrap_or_else(|| panic!("there is no column {name} in {head:?}"));
-            reader.records().map(|row| row.unwrap()[at].to_owned()).collect()
-        };
         let text = fs::read_to_string(&progress).unwrap();
         for length in column(&text, "mean_length") {
             let length: f64 = length.parse().unwrap();

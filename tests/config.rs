@@ -420,7 +420,7 @@ fn every_option_has_a_rule_that_its_default_follows() {
             unstated.push(option.key);
         }
     }
-    // These are checked by code: the variants, and what relates constants of a world to one another.
+    // These are checked by code: variants, shifts, and what relates constants of a world to one another.
     let checked_elsewhere = [
         "env.lava-grid.map",
         "env.lava-point.goal.max",
@@ -429,6 +429,7 @@ fn every_option_has_a_rule_that_its_default_follows() {
         "env.lava-point.lava.min",
         "env.lava-point.radius",
         "env.lava-point.start",
+        "experiment.shifts",
         "experiment.variant",
     ];
     assert_eq!(unstated, checked_elsewhere);

@@ -175,7 +175,7 @@ impl Schema {
                 let allowed = format!("a list of {length} numbers, such as {example}");
                 return Err(rules::refused(key, value, origin, allowed));
             }
-            (Value::Array(_), None) => rules::check_set(key, value, origin)?,
+            (Value::Array(_), None) if *rule != Rule::Free => rules::check_set(key, value, origin)?,
             _ => {}
         }
         rule.check(key, value, origin)
