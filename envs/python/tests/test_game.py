@@ -92,3 +92,6 @@ def test_bad_actions_are_refused() -> None:
         LavaGame("lava-point", components=4)
     with pytest.raises(ValueError, match="softmax"):
         LavaGame("lava-grid", family="bumps")
+    # No budget can pay for it.
+    with pytest.raises(ValueError, match="without a bound"):
+        LavaGame("lava-point", family="shift")
