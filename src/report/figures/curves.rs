@@ -230,9 +230,9 @@ pub(super) fn profile(panels: &[Panel]) -> Option<(Picture, String)> {
 pub(super) fn improvement(panels: &[Panel]) -> Option<(Picture, String)> {
     let against = |panel: &Panel| {
         let first = panels.iter().find(|of| of.group.eta == panel.group.eta)?;
-        let others = panel.group.method != first.group.method;
-        let of = first.group.improvement(panel.group).filter(|_| others)?;
-        Some((format!("{}  >  {}", first.group.title(), panel.group.title()), of))
+        let (own, other) = (first.group.method.as_ref()?, panel.group.method.as_ref()?);
+        let of = first.group.improvement(panel.group).filter(|_| own != other)?;
+        Some((format!("{own}  >  {other}, eta = {}", panel.group.eta), of))
     };
     let rows: Vec<_> = panels.iter().filter_map(against).collect();
     let widest = rows.iter().map(|(title, _)| words_width(title)).max()?;
