@@ -197,7 +197,7 @@ class LavaVectorEnv(gym.vector.VectorEnv[Array, Any, Array]):
         autoreset_mode: When an ended episode is followed by the next one: Gymnasium's ``NEXT_STEP``,
             ``SAME_STEP`` or ``DISABLED``.
         render_mode: As that of :class:`LavaEnv`; ``render()`` returns a frame per slot.
-        info: Whether a step tells more than the clearance, which takes a third of the time on lava-grid.
+        info: Whether a step tells more than the clearance, which takes a sixth of the time on lava-grid.
 
     Every array that it returns is a new one. The interpreter is released while the batch is stepped.
     """
