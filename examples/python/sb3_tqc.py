@@ -64,7 +64,7 @@ def train(seed: int, steps: int = STEPS, drop: int = 2, verbose: int = 0) -> TQC
         "MlpPolicy",
         VecMonitor(LavaVecEnv("lava-point", SLOTS)),
         learning_rate=1e-3,
-        buffer_size=STEPS + SCRIPTED,
+        buffer_size=steps + SCRIPTED,
         learning_starts=0,
         batch_size=256,
         # With 1 and without the time, waiting until the limit seems cheap.

@@ -241,19 +241,19 @@ pub(super) fn improvement(panels: &[Panel]) -> Option<(Picture, String)> {
     let at = |share: f64| left + (share * f64::from(width)).round() as i32;
     let size = ((left + width + 60) as u32, (bottom + 120) as u32);
     let svg = figure(size, |canvas| {
+        let words = |side| text(TEXT, INK, side, VPos::Center);
         for share in [0.0, 0.25, 0.5, 0.75, 1.0] {
             let line = vec![(at(share), top), (at(share), bottom)];
             let style = INK.mix(if share == 0.5 { 1.0 } else { 0.2 }).stroke_width(2);
             canvas.draw(&PathElement::new(line, style))?;
-            let centred = text(TEXT, INK, HPos::Center, VPos::Center);
-            canvas.draw(&Text::new(short(share), (at(share), bottom + 28), centred))?;
+            let place = (at(share), bottom + 28);
+            canvas.draw(&Text::new(short(share), place, words(HPos::Center)))?;
         }
-        let centred = text(TEXT, INK, HPos::Center, VPos::Center);
-        canvas.draw(&Text::new("probability", (at(0.5), bottom + 76), centred))?;
+        let place = (at(0.5), bottom + 76);
+        canvas.draw(&Text::new("probability", place, words(HPos::Center)))?;
         for (row, (title, of)) in rows.iter().enumerate() {
             let y = top + height * row as i32 + height / 2;
-            let right = text(TEXT, INK, HPos::Right, VPos::Center);
-            canvas.draw(&Text::new(title.clone(), (left - 24, y), right))?;
+            canvas.draw(&Text::new(title.clone(), (left - 24, y), words(HPos::Right)))?;
             if let Some(interval) = of.interval {
                 let band = [(at(interval.low), y - 14), (at(interval.high), y + 14)];
                 canvas.draw(&Rectangle::new(band, colour(0).mix(0.35).filled()))?;
