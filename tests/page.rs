@@ -200,6 +200,10 @@ fn figures_name_methods_and_variants() {
     for name in ["frontier", "cross", "learning", "occupancy", "deviations"] {
         assert!(svg(&format!("lava-grid-{name}")).contains("game/k-1"), "{name}");
     }
+    assert!(svg("lava-grid-improvement").contains("game  &gt;  game/k-1, eta = 25"));
+    let improvement =
+        written.figures.drawn.iter().any(|figure| figure.name == "lava-point-improvement");
+    assert!(!improvement, "it compares what was not in the same world");
     assert!(svg("lava-point-learning").contains("mine, eta = 25"));
     assert!(!svg("lava-point-shifts").contains("mine"), "it has another world");
     let missing = "lava-point: maps of mine, eta = 25, whose constants are not those of the others";

@@ -229,7 +229,8 @@ pub(super) fn profile(panels: &[Panel]) -> Option<(Picture, String)> {
 /// CVaR_1/eta than one of each other method.
 pub(super) fn improvement(panels: &[Panel]) -> Option<(Picture, String)> {
     let against = |panel: &Panel| {
-        let first = panels.iter().find(|of| of.group.eta == panel.group.eta)?;
+        let alike = |of: &&Panel| of.group.eta == panel.group.eta && of.task() == panel.task();
+        let first = panels.iter().find(alike)?;
         let (own, other) = (first.group.method.as_ref()?, panel.group.method.as_ref()?);
         let of = first.group.improvement(panel.group).filter(|_| own != other)?;
         Some((format!("{own}  >  {other}, eta = {}", panel.group.eta), of))
