@@ -76,13 +76,16 @@ pub fn require(
 /// Names the first one that is out of range.
 pub fn require_rewards(
     step_cost: f64,
-    goal_reward: f64,
-    lava_reward: f64,
+    [goal_reward, lesser_goal_reward, lava_reward]: [f64; 3],
     horizon: u32,
 ) -> Result<(), ConfigError> {
     let cost = |cost: f64| (0.0..=1e6).contains(&cost);
     require("step_cost", step_cost, cost, "in [0, 1000000] (it is subtracted)")?;
-    for (field, reward) in [("goal_reward", goal_reward), ("lava_reward", lava_reward)] {
+    for (field, reward) in [
+        ("goal_reward", goal_reward),
+        ("lesser_goal_reward", lesser_goal_reward),
+        ("lava_reward", lava_reward),
+    ] {
         require(field, reward, |reward| reward.abs() <= 1e6, "in [-1000000, 1000000]")?;
     }
     if !(1..=1_000_000).contains(&horizon) {

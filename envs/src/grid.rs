@@ -26,7 +26,7 @@ pub const MOVES: usize = 4;
 /// The constants, with what they mean, their defaults and their ranges.
 const DEFAULTS: &str = r#"# lava-grid: a walk over the cells of a map, with slips. Lengths are in cells.
 
-# The map: S start (one), G goal, L lava, . free, # wall. The paper's 10 x 7 cells. Rows are equally
+# The map: S start (one), G goal, g lesser goal, L lava, . free, # wall. The paper's 10 x 7 cells. Rows are equally
 # long; white space around them does not count. A way past lava and walls leads to a goal within the
 # time limit.
 map = """
@@ -51,6 +51,10 @@ step_cost = 0.035
 # Range: [-1000000, 1000000]
 goal_reward = 1.0
 
+# Reward on entering a lesser goal `g`, which ends the episode too. The paper's map has none.
+# Range: [-1000000, 1000000]
+lesser_goal_reward = 0.5
+
 # Reward on entering lava, which ends the episode.
 # Range: [-1000000, 1000000]
 lava_reward = -1.0
@@ -73,10 +77,18 @@ pub struct GridConfig {
     pub step_cost: f64,
     /// Reward on entering a goal.
     pub goal_reward: f64,
+    /// Reward on entering a lesser goal; former versions had none.
+    #[serde(default = "lesser_goal_reward")]
+    pub lesser_goal_reward: f64,
     /// Reward on entering lava.
     pub lava_reward: f64,
     /// Time limit T in steps.
     pub horizon: u32,
+}
+
+/// The default of [`GridConfig::lesser_goal_reward`].
+fn lesser_goal_reward() -> f64 {
+    0.5
 }
 
 impl Default for GridConfig {
@@ -112,7 +124,8 @@ impl GridConfig {
 
     fn parse(&self) -> Result<Map, ConfigError> {
         require("slip", self.slip, |p| (0.0..=1.0).contains(&p), "a probability in [0, 1]")?;
-        require_rewards(self.step_cost, self.goal_reward, self.lava_reward, self.horizon)?;
+        let rewards = [self.goal_reward, self.lesser_goal_reward, self.lava_reward];
+        require_rewards(self.step_cost, rewards, self.horizon)?;
         Map::parse(&self.map)
     }
 }
@@ -229,7 +242,7 @@ impl LavaGrid {
 
     /// Whether entering the cell ends the episode with [`End::Goal`].
     pub fn is_goal(&self, cell: usize) -> bool {
-        self.map.tile(cell) == Tile::Goal
+        self.map.tile(cell).is_goal()
     }
 
     /// Whether the cell can never be entered.
@@ -256,7 +269,7 @@ impl LavaGrid {
 
 /// See [`LavaGrid::successor`].
 fn successor(config: &GridConfig, map: &Map, cell: usize, executed: Move) -> (usize, Step) {
-    if matches!(map.tile(cell), Tile::Goal | Tile::Lava) {
+    if matches!(map.tile(cell), Tile::Goal | Tile::LesserGoal | Tile::Lava) {
         return (cell, Step::IDLE);
     }
     let (x, y) = map.coordinates(cell);
@@ -270,6 +283,7 @@ fn successor(config: &GridConfig, map: &Map, cell: usize, executed: Move) -> (us
     let next = if map.tile(next) == Tile::Wall { cell } else { next };
     let step = match map.tile(next) {
         Tile::Goal => Step { reward: config.goal_reward, end: Some(End::Goal) },
+        Tile::LesserGoal => Step { reward: config.lesser_goal_reward, end: Some(End::Goal) },
         Tile::Lava => Step { reward: config.lava_reward, end: Some(End::Lava) },
         Tile::Free | Tile::Wall => Step { reward: -config.step_cost, end: None },
     };
@@ -324,6 +338,10 @@ impl World for LavaGrid {
     const SITUATION: usize = 2 + MOVES;
     /// Both vectors begin with the position.
     const POSITIONS: usize = 2;
+
+    fn of_map(map: &Map) -> Result<toml::Table, String> {
+        Ok(toml::Table::from_iter([("map".to_owned(), map.to_string().into())]))
+    }
 
     fn new(config: &GridConfig, episodes: usize) -> Result<Self, ConfigError> {
         let map = config.parse()?;
@@ -423,6 +441,7 @@ impl World for LavaGrid {
             Tile::Free => None,
             Tile::Lava => Some(AreaKind::Lava),
             Tile::Goal => Some(AreaKind::Goal),
+            Tile::LesserGoal => Some(AreaKind::LesserGoal),
             Tile::Wall => Some(AreaKind::Wall),
         };
         let area = |of: usize| {
@@ -445,7 +464,13 @@ impl World for LavaGrid {
 
     fn return_range(&self, gamma: f64) -> Option<[f64; 2]> {
         let of = &self.config;
-        Some(return_range(of.step_cost, [of.goal_reward, of.lava_reward], of.horizon, gamma))
+        let ends = (0..self.cells()).filter_map(|cell| match self.map.tile(cell) {
+            Tile::Goal => Some(of.goal_reward),
+            Tile::LesserGoal => Some(of.lesser_goal_reward),
+            Tile::Lava => Some(of.lava_reward),
+            Tile::Free | Tile::Wall => None,
+        });
+        Some(return_range(of.step_cost, &ends.collect::<Vec<_>>(), of.horizon, gamma))
     }
 
     fn headline(&self) -> String {
@@ -535,7 +560,7 @@ impl FiniteModel for LavaGrid {
 
     fn ended(&self, cell: usize) -> Option<End> {
         match self.map.tile(cell) {
-            Tile::Goal => Some(End::Goal),
+            Tile::Goal | Tile::LesserGoal => Some(End::Goal),
             Tile::Lava => Some(End::Lava),
             Tile::Free | Tile::Wall => None,
         }

@@ -5,7 +5,8 @@
 //! | character | cell |
 //! |---|---|
 //! | `S` | start (exactly one) |
-//! | `G` | goal (at least one) |
+//! | `G` | goal (at least one, of either kind) |
+//! | `g` | a lesser goal, which pays another reward |
 //! | `L` | lava |
 //! | `.` | free |
 //! | `#` | wall: a move into it leaves the state unchanged, as the edge of the map does |
@@ -28,8 +29,17 @@ pub enum Tile {
     Lava,
     /// Entering it ends the episode well.
     Goal,
+    /// A goal that pays another reward.
+    LesserGoal,
     /// It cannot be entered.
     Wall,
+}
+
+impl Tile {
+    /// Whether entering it ends the episode well.
+    pub fn is_goal(self) -> bool {
+        matches!(self, Tile::Goal | Tile::LesserGoal)
+    }
 }
 
 /// A rectangle of tiles with one start. Cells are numbered row by row: cell = y * width + x.
@@ -78,12 +88,14 @@ impl Map {
                     '.' => Tile::Free,
                     'L' => Tile::Lava,
                     'G' => Tile::Goal,
+                    'g' => Tile::LesserGoal,
                     '#' => Tile::Wall,
                     'S' => Tile::Free,
                     _ => {
                         let problem = format!("{character:?} is no cell");
                         let remedy =
-                            "use S (start), G (goal), L (lava), . (free) or # (wall)".to_owned();
+                            "use S (start), G (goal), g (lesser goal), L (lava), . (free) or # (wall)"
+                                .to_owned();
                         return Err(error(row, column, problem, &remedy));
                     }
                 };
@@ -91,7 +103,7 @@ impl Map {
                     let remedy = "keep exactly one and write `.` for the others";
                     return Err(error(row, column, "a second start S".into(), remedy));
                 }
-                goals += usize::from(tile == Tile::Goal);
+                goals += usize::from(tile.is_goal());
                 if tiles.len() == MAX_CELLS {
                     let problem = format!("the map has more than {MAX_CELLS} cells");
                     return Err(error(row, column, problem, "draw a smaller map"));
@@ -127,11 +139,11 @@ impl Map {
         seen[self.start] = true;
         let (mut reached, mut moves) = (vec![self.start], 0);
         while !reached.is_empty() {
-            if reached.iter().any(|&cell| self.tile(cell) == Tile::Goal) {
+            if reached.iter().any(|&cell| self.tile(cell).is_goal()) {
                 return Some(moves);
             }
             let near = reached.iter().flat_map(|&cell| self.neighbours(cell));
-            let free = |cell: &usize| matches!(self.tile(*cell), Tile::Free | Tile::Goal);
+            let free = |cell: &usize| !matches!(self.tile(*cell), Tile::Lava | Tile::Wall);
             let new = |cell: &usize| !std::mem::replace(&mut seen[*cell], true);
             reached = near.filter(free).filter(new).collect();
             moves += 1;
@@ -150,6 +162,29 @@ impl Map {
             (x > 0).then(|| cell - 1),
         ];
         all.into_iter().flatten()
+    }
+
+    /// The cells of one kind as few rectangles `[x_min, y_min, x_max, y_max]`, in cells, that do not overlap:
+    /// runs of a row, each as many rows downward as they repeat.
+    pub fn rectangles(&self, tile: Tile) -> Vec<[usize; 4]> {
+        let mut taken = vec![false; self.cells()];
+        let mut found = Vec::new();
+        for cell in 0..self.cells() {
+            let is = |cell: usize, taken: &[bool]| self.tiles[cell] == tile && !taken[cell];
+            if !is(cell, &taken) {
+                continue;
+            }
+            let (left, top) = self.coordinates(cell);
+            let right =
+                (left..self.width).find(|&x| !is(self.cell(x, top), &taken)).unwrap_or(self.width);
+            let same = |y: usize| (left..right).all(|x| is(self.cell(x, y), &taken));
+            let bottom = (top..self.height()).find(|&y| !same(y)).unwrap_or(self.height());
+            for y in top..bottom {
+                taken[self.cell(left, y)..self.cell(left, y) + right - left].fill(true);
+            }
+            found.push([left, top, right, bottom]);
+        }
+        found
     }
 
     /// Number of columns.
@@ -201,6 +236,7 @@ impl std::fmt::Display for Map {
                 Tile::Free => '.',
                 Tile::Lava => 'L',
                 Tile::Goal => 'G',
+                Tile::LesserGoal => 'g',
                 Tile::Wall => '#',
             };
             write!(formatter, "{character}")?;

@@ -8,7 +8,7 @@
 //! 4. in the first substep in which the disc touches lava the episode ends with `lava_reward`, in
 //!    which its centre gets inside the goal region with `goal_reward`; of two impacts in one substep
 //!    the earlier one counts, and lava if they coincide. Both tests are swept along the substep's
-//!    motion ([`geometry`]), so that no fast body jumps over a corner. Otherwise the reward is
+//!    motion ([`geometry`]), so that no fast body jumps over a corner. Walls inside the arena bend the motion there. Otherwise the reward is
 //!    `-step_cost`, and after T steps the episode ends.
 //!
 //! The state is position and velocity in f32, Rapier's precision; x counts to the right, y downward,
@@ -23,10 +23,11 @@ pub use config::{PointConfig, Rectangle};
 use crate::action::{Action, Plane};
 use crate::error::{ConfigError, NoSuchState};
 use crate::law::GaussianLaw;
+use crate::map::Map;
 use crate::random::ChaCha8Rng;
 use crate::scene::{Area, AreaKind, Field, Scene as Picture};
 use crate::world::{End, Step, World, return_range};
-use geometry::Scene;
+use geometry::{Scene, Slid};
 use nalgebra::Vector2;
 use physics::{Body, Physics};
 use rand::{Rng, RngExt};
@@ -89,6 +90,10 @@ pub struct LavaPoint {
     moving: Vec<usize>,
     /// Work space: where each of them was before the substep.
     before: Vec<Vector>,
+    /// Work space: the path of each of them in this substep, where walls inside the arena have bent it.
+    slid: Vec<Option<Slid>>,
+    /// Work space: the slots that no such wall stops in this substep.
+    free: Vec<usize>,
 }
 
 impl LavaPoint {
@@ -112,13 +117,15 @@ impl LavaPoint {
     /// initial one. For tests and for yardsticks that need other starts.
     ///
     /// # Panics
-    /// If the disc does not lie in the arena or a number is not finite.
+    /// If the disc does not lie in the arena, lies in a wall, or a number is not finite.
     pub fn place(&mut self, slot: usize, position: [f64; 2], velocity: [f64; 2]) {
         let inside = (0..2).all(|axis| {
             let margin = self.config.radius - 1e-4; // a disc at a wall has rounding errors
             position[axis] >= margin && position[axis] <= self.config.arena[axis] - margin
         });
         assert!(inside, "a disc of radius {} at {position:?} leaves the arena", self.config.radius);
+        let in_wall = self.scene.in_wall(vector(position), 1e-4);
+        assert!(!in_wall, "a disc of radius {} at {position:?} lies in a wall", self.config.radius);
         assert!(velocity.iter().all(|v| v.is_finite()), "the velocity {velocity:?} is not finite");
         self.bodies[slot] = Body { position: vector(position), velocity: vector(velocity) };
         self.clocks[slot] = Clock { time: 0, ended: false };
@@ -127,6 +134,29 @@ impl LavaPoint {
     /// Mean velocity vbar = v + A u after the push, in m/s.
     pub fn mean_velocity(&self, slot: usize, action: Force) -> Vector2<f64> {
         Vector2::from(self.velocity(slot)) + self.config.acceleration * action.on_disc()
+    }
+
+    /// Moves the bodies of the moving slots by one substep.
+    fn substep(&mut self) {
+        if !self.scene.has_walls() {
+            return self.physics.substep(&mut self.bodies, &self.moving);
+        }
+        self.slid.clear();
+        self.free.clear();
+        for &slot in &self.moving {
+            let body = &mut self.bodies[slot];
+            let velocity = self.physics.limited(body.velocity);
+            let slid = self.scene.slide(body.position, velocity, self.physics.dt());
+            match slid {
+                None => self.free.push(slot),
+                Some(slid) => {
+                    *body =
+                        Body { position: slid.end(), velocity: self.physics.damped(slid.velocity) };
+                }
+            }
+            self.slid.push(slid);
+        }
+        self.physics.substep(&mut self.bodies, &self.free);
     }
 
     fn scaled_position(&self, slot: usize) -> [f32; 2] {
@@ -162,6 +192,11 @@ impl World for LavaPoint {
     /// Both vectors begin with the position.
     const POSITIONS: usize = 2;
 
+    /// A cell is a square metre, and the disc starts in the middle of its cell.
+    fn of_map(map: &Map) -> Result<toml::Table, String> {
+        config::of_map(map)
+    }
+
     fn new(config: &PointConfig, episodes: usize) -> Result<Self, ConfigError> {
         config.check_values()?;
         let start = Body { position: vector(config.start), velocity: Vector::ZERO };
@@ -172,6 +207,8 @@ impl World for LavaPoint {
             clocks: vec![Clock { time: 0, ended: false }; episodes],
             moving: Vec::with_capacity(episodes),
             before: Vec::with_capacity(episodes),
+            slid: Vec::new(),
+            free: Vec::new(),
             config: config.clone(),
         })
     }
@@ -197,17 +234,18 @@ impl World for LavaPoint {
         self.clocks[slot] = Clock { time: 0, ended: false };
     }
 
-    /// The position is uniform over where the disc touches neither lava nor goal, the velocity normal with
+    /// The position is uniform over where the disc touches neither lava nor wall nor goal, the velocity normal with
     /// the noise's standard deviation. Where almost nothing of the arena is free, the slot is reset.
     fn scatter(&mut self, slot: usize, random: &mut ChaCha8Rng) {
-        let PointConfig { arena, radius, goal, noise, horizon, .. } = self.config;
+        let PointConfig { arena, radius, noise, horizon, .. } = self.config;
         if horizon == 1 {
             return self.reset(slot);
         }
         let free = (0..MOST_DRAWS).find_map(|_| {
             let place = arena.map(|side| random.random_range(radius..=side - radius));
-            let in_goal = (0..2).all(|i| (goal.min[i]..=goal.max[i]).contains(&place[i]));
-            (!in_goal && self.scene.clearance(vector(place)) > 0.0).then_some(place)
+            let centre = vector(place);
+            let ended = self.scene.in_goal(centre) || self.scene.clearance(centre) == 0.0;
+            (!ended && !self.scene.in_wall(centre, 0.0)).then_some(place)
         });
         let Some(position) = free else { return self.reset(slot) };
         let fastest = physics::speed_limit(&self.config);
@@ -233,6 +271,7 @@ impl World for LavaPoint {
             (0.0..=self.config.arena[axis] as f32).contains(&position[axis])
                 && velocity[axis].abs() <= fastest
         });
+        let possible = possible && !self.scene.in_wall(position.into(), 1e-3);
         // A running episode has time left.
         if !possible || clock.time > self.config.horizon - u32::from(!clock.ended) {
             return Err(NoSuchState::of(&snapshot));
@@ -262,7 +301,7 @@ impl World for LavaPoint {
         situation[2..].copy_from_slice(&[velocity.x as f32, velocity.y as f32]);
     }
 
-    /// Distance from the disc's surface to the lava rectangle in metres, 0 at contact.
+    /// Distance from the disc's surface to the nearest lava in metres, 0 at contact.
     fn clearance(&self, slot: usize) -> f64 {
         self.scene.clearance(self.bodies[slot].position)
     }
@@ -272,14 +311,20 @@ impl World for LavaPoint {
     }
 
     fn scene(&self) -> Picture {
-        let PointConfig { arena, lava, goal, start, step_cost, goal_reward, lava_reward, .. } =
-            self.config;
+        let PointConfig { arena, start, step_cost, goal_reward, lava_reward, .. } = self.config;
         let area = |kind, of: Rectangle| Area { kind, min: of.min, max: of.max };
+        let goal = |(goal, reward): (Rectangle, f64)| {
+            let lesser = reward != self.config.goal_reward;
+            area(if lesser { AreaKind::LesserGoal } else { AreaKind::Goal }, goal)
+        };
+        let mut areas: Vec<Area> = self.config.lava().map(|of| area(AreaKind::Lava, of)).collect();
+        areas.extend(self.config.goals().map(goal));
+        areas.extend(self.config.walls().map(|of| area(AreaKind::Wall, of)));
         Picture {
             size: arena,
             cells: false,
             start,
-            areas: vec![area(AreaKind::Lava, lava), area(AreaKind::Goal, goal)],
+            areas,
             rules: format!(
                 "A step costs {step_cost}, lava pays {lava_reward} and the goal {goal_reward}, both of \
                  which end the episode; so does step {}. The noise has a standard deviation of {} m/s.",
@@ -290,7 +335,8 @@ impl World for LavaPoint {
 
     fn return_range(&self, gamma: f64) -> Option<[f64; 2]> {
         let of = &self.config;
-        Some(return_range(of.step_cost, [of.goal_reward, of.lava_reward], of.horizon, gamma))
+        let ends = of.goals().map(|(_, reward)| reward).chain([of.lava_reward]);
+        Some(return_range(of.step_cost, &ends.collect::<Vec<_>>(), of.horizon, gamma))
     }
 
     fn state_columns(&self, slot: usize) -> Vec<(&'static str, Field)> {
@@ -345,20 +391,19 @@ impl World for LavaPoint {
         for _ in 0..self.config.substeps {
             self.before.clear();
             self.before.extend(self.moving.iter().map(|&slot| self.bodies[slot].position));
-            self.physics.substep(&mut self.bodies, &self.moving);
+            self.substep();
 
             let mut kept = 0;
             for index in 0..self.moving.len() {
                 let slot = self.moving[index];
                 let position = &mut self.bodies[slot].position;
-                if let Some((impact, end)) = self.scene.impact(self.before[index], *position) {
+                let impact = match self.slid.get(index).copied().flatten() {
+                    None => self.scene.impact(self.before[index], *position),
+                    Some(slid) => slid.legs().find_map(|(from, to)| self.scene.impact(from, to)),
+                };
+                if let Some((impact, end, reward)) = impact {
                     *position = impact;
                     self.clocks[slot].ended = true;
-                    let reward = match end {
-                        End::Goal => self.config.goal_reward,
-                        End::Lava => self.config.lava_reward,
-                        End::Timeout => unreachable!("a place in the arena is no time limit"),
-                    };
                     steps[slot] = Step { reward, end: Some(end) };
                 } else {
                     self.moving[kept] = slot;

@@ -37,6 +37,8 @@ pub enum AreaKind {
     Lava,
     /// Entering it ends the episode well.
     Goal,
+    /// A goal that pays another reward.
+    LesserGoal,
     /// It cannot be entered.
     Wall,
 }

@@ -4,6 +4,7 @@ use crate::action::Action;
 use crate::error::{ConfigError, NoSuchState};
 use crate::finite::FiniteModel;
 use crate::law::Law;
+use crate::map::Map;
 use crate::random::ChaCha8Rng;
 use crate::scene::{Field, Scene};
 use rand::RngExt;
@@ -75,6 +76,14 @@ pub trait World: Sized + Send + Sync + 'static {
     /// How many of the first numbers of both vectors are coordinates of a place, each in [-1, 1]. Features
     /// show them in finer detail; 0 shows all numbers as they are.
     const POSITIONS: usize = 0;
+
+    /// The constants that lay this world out as a map, to be written over others.
+    ///
+    /// # Errors
+    /// If the world cannot be laid out so, with the reason.
+    fn of_map(_map: &Map) -> Result<toml::Table, String> {
+        Err("it has no maps".to_owned())
+    }
 
     /// The default constants, as [`World::DEFAULTS`] has them.
     ///
@@ -215,7 +224,7 @@ pub trait World: Sized + Send + Sync + 'static {
 
 /// The least and the greatest return of an episode that costs `step_cost` in each step but the last, which
 /// pays one of `ends`, or that costs it in each of `horizon` steps.
-pub(crate) fn return_range(step_cost: f64, ends: [f64; 2], horizon: u32, gamma: f64) -> [f64; 2] {
+pub(crate) fn return_range(step_cost: f64, ends: &[f64], horizon: u32, gamma: f64) -> [f64; 2] {
     // sum_{t < steps} gamma^t and gamma^steps.
     let discounts = |steps: u32| {
         let last = gamma.powf(f64::from(steps));
@@ -227,7 +236,7 @@ pub(crate) fn return_range(step_cost: f64, ends: [f64; 2], horizon: u32, gamma: 
     let mut range = [-step_cost * all; 2];
     for steps in [0, horizon - 1] {
         let (sum, last) = discounts(steps);
-        for end in ends {
+        for &end in ends {
             let value = last * end - step_cost * sum;
             range = [range[0].min(value), range[1].max(value)];
         }
@@ -241,10 +250,10 @@ mod tests {
 
     #[test]
     fn the_range_of_returns_has_the_shortest_and_the_longest_episodes() {
-        let [least, greatest] = return_range(0.035, [1.0, -1.0], 40, 1.0);
+        let [least, greatest] = return_range(0.035, &[1.0, -1.0], 40, 1.0);
         assert!((least - (-1.0 - 39.0 * 0.035)).abs() < 1e-12 && greatest == 1.0);
         // With gamma = 1/2 and two steps: -1, -1 - 1/2, or an end at once or after a step of cost 1.
-        assert_eq!(return_range(1.0, [4.0, -4.0], 2, 0.5), [-4.0, 4.0]);
-        assert_eq!(return_range(1.0, [-4.0, -8.0], 2, 0.5), [-8.0, -1.5]);
+        assert_eq!(return_range(1.0, &[4.0, -4.0], 2, 0.5), [-4.0, 4.0]);
+        assert_eq!(return_range(1.0, &[-4.0, -8.0], 2, 0.5), [-8.0, -1.5]);
     }
 }

@@ -402,7 +402,7 @@ fn refusals_name_field_value_and_range() {
             "goal = Rectangle",
         ),
         (PointConfig { start: [0.05, 0.5], ..base() }, "start = [0.05, 0.5] is not allowed"),
-        (PointConfig { start: [1.95, 1.0], ..base() }, "touch neither the lava"),
+        (PointConfig { start: [1.95, 1.0], ..base() }, "touch neither lava"),
         (PointConfig { start: [9.5, 0.5], ..base() }, "the goal region"),
         (
             PointConfig { radius: 3.5, ..base() },
@@ -440,4 +440,138 @@ fn configurations_are_read_from_toml() {
     assert!(changed("min = [2.0, 0.0]", "min = [2.0, 0.0]\nx = 1").is_err());
     let text = toml::to_string(&PointConfig::default()).unwrap();
     assert_eq!(toml::from_str::<PointConfig>(&text).unwrap(), PointConfig::default());
+}
+
+/// A room of walls inside a larger arena.
+fn room() -> PointConfig {
+    PointConfig {
+        arena: [14.0, 11.0],
+        lava: Rectangle { min: [4.0, 2.0], max: [10.0, 4.0] },
+        goal: Rectangle { min: [11.0, 2.0], max: [12.0, 3.0] },
+        start: [2.5, 2.5],
+        walls: vec![
+            [0.0, 0.0, 2.0, 11.0],
+            [12.0, 0.0, 14.0, 11.0],
+            [2.0, 0.0, 12.0, 2.0],
+            [2.0, 9.0, 12.0, 11.0],
+        ],
+        ..PointConfig::default()
+    }
+}
+
+/// A wall inside the arena stops a disc as the arena's sides do, which Rapier decides.
+#[test]
+fn walls_inside_stop_as_the_sides_of_the_arena_do() {
+    let (inner, outer) = (room(), PointConfig::default());
+    inner.validate().unwrap();
+    let mut random = stream(2, Purpose::Outcomes, 0);
+    let mut touched = 0;
+    for _ in 0..20_000 {
+        let position = [random.random_range(0.11..9.89), random.random_range(2.2..6.89)];
+        let velocity = [random.random_range(-8.0..8.0), random.random_range(-8.0..8.0)];
+        let (expected, step) = step_from(&outer, position, velocity, REST, CALM);
+        let (found, same) = step_from(&inner, position.map(|c| c + 2.0), velocity, REST, CALM);
+        assert_eq!(found.time(0), expected.time(0));
+        assert_eq!(same, step, "from {position:?}, {velocity:?}");
+        let here = found.position(0).map(|c| c - 2.0);
+        assert!(
+            close(here, expected.position(0), 3e-5)
+                && close(found.velocity(0), expected.velocity(0), 3e-5),
+            "from {position:?}, {velocity:?}: {here:?}, {:?} instead of {:?}, {:?}",
+            found.velocity(0),
+            expected.position(0),
+            expected.velocity(0),
+        );
+        touched += usize::from((0..2).any(|axis| expected.velocity(0)[axis] == 0.0));
+    }
+    assert!(touched > 1000, "only {touched} contacts");
+}
+
+/// At a corner the component along the radius to the corner is lost, and no other.
+#[test]
+fn a_disc_slides_off_a_corner() {
+    let config =
+        PointConfig { walls: vec![[4.0, 4.0, 5.0, 5.0]], substeps: 1, ..PointConfig::default() };
+    // It comes from above and touches the corner (4, 4) where the radius has the slope 3 : 4.
+    let contact = [4.0 - 0.06, 4.0 - 0.08];
+    let (world, _) = step_from(&config, [contact[0], contact[1] - 0.5], [0.0, 5.0], REST, CALM);
+    // Of the way of 1 m half is left. Along the tangent (-4, 3) / 5 it is 0.3 m, and the speed 3 m/s, then damped.
+    let expected = [contact[0] - 0.3 * 0.8, contact[1] + 0.3 * 0.6];
+    assert!(close(world.position(0), expected, 1e-5), "{:?}", world.position(0));
+    let expected = [-3.0 * 0.8 * 0.5, 3.0 * 0.6 * 0.5];
+    assert!(close(world.velocity(0), expected, 1e-5), "{:?}", world.velocity(0));
+}
+
+/// However fast, a disc never enters a wall, nor leaves a room whose walls are thin and whose corners are narrow.
+#[test]
+fn walls_inside_hold_at_any_speed() {
+    let mut walls = vec![
+        [2.0, 3.0, 2.05, 6.0],
+        [8.0, 3.0, 8.05, 6.0],
+        [2.0, 3.0, 8.05, 3.05],
+        [2.0, 5.95, 8.05, 6.0],
+    ];
+    // Pillars, and a wedge of two walls.
+    for pillar in 0..6 {
+        let x = 2.7 + 0.9 * f64::from(pillar);
+        walls.push([x, 4.3, x + 0.2, 4.5]);
+    }
+    walls.push([3.0, 5.0, 3.5, 5.1]);
+    walls.push([3.4, 5.0, 3.5, 5.6]);
+    let config = PointConfig { walls: walls.clone(), ..PointConfig::default() };
+    let slots = 2000;
+    let mut world = LavaPoint::new(&config, slots).unwrap();
+    let mut random = stream(3, Purpose::Outcomes, 0);
+    for slot in 0..slots {
+        world.place(slot, [2.4 + 0.002 * slot as f64, 3.6], [0.0, 0.0]);
+    }
+    let mut steps = vec![Step::IDLE; slots];
+    for time in 0..30 {
+        let scale = [1.0, 10.0, 1000.0][time % 3];
+        let noise: Vec<_> = (0..slots)
+            .map(|_| {
+                scale
+                    * Vector2::new(
+                        random.sample::<f64, _>(StandardNormal),
+                        random.sample::<f64, _>(StandardNormal),
+                    )
+            })
+            .collect();
+        world.apply(&vec![REST; slots], &noise, &mut steps);
+        for slot in 0..slots {
+            let [x, y] = world.position(slot);
+            assert!(
+                (2.14..=7.91).contains(&x) && (3.14..=5.86).contains(&y),
+                "{x}, {y} is outside"
+            );
+            for &[left, top, right, bottom] in &walls {
+                let gap = [(left - x).max(x - right).max(0.0), (top - y).max(y - bottom).max(0.0)];
+                assert!(gap[0].hypot(gap[1]) >= 0.1 - 1e-4, "({x}, {y}) is in a wall");
+            }
+        }
+    }
+}
+
+/// A world with one rectangle of lava and one in four parts are the same.
+#[test]
+fn lava_in_parts_is_lava() {
+    let whole = PointConfig::default();
+    let parts = PointConfig {
+        lava: Rectangle { min: [2.0, 0.0], max: [5.0, 1.0] },
+        more_lava: vec![[5.0, 0.0, 8.0, 1.0], [2.0, 1.0, 5.0, 2.0], [5.0, 1.0, 8.0, 2.0]],
+        ..PointConfig::default()
+    };
+    let mut random = stream(4, Purpose::Outcomes, 0);
+    let mut ends = 0;
+    for _ in 0..20_000 {
+        let position = [random.random_range(0.1..9.9), random.random_range(2.11..3.0)];
+        let velocity = [random.random_range(-8.0..8.0), random.random_range(-8.0..8.0)];
+        let (a, one) = step_from(&whole, position, velocity, REST, CALM);
+        let (b, other) = step_from(&parts, position, velocity, REST, CALM);
+        assert_eq!(one, other);
+        assert!(close(a.position(0), b.position(0), 1e-5));
+        assert!((a.clearance(0) - b.clearance(0)).abs() < 1e-6);
+        ends += usize::from(one.end == Some(End::Lava));
+    }
+    assert!(ends > 1000, "only {ends} ends");
 }

@@ -74,6 +74,10 @@ pub struct Overrides {
     /// selected world that has it. May be repeated; a later one wins.
     #[arg(long = "set", value_name = "KEY=VALUE")]
     pub settings: Vec<String>,
+    /// Plays every selected world on this scene: a name that `cvar-game envs` lists, or a TOML file with a map. May be
+    /// repeated.
+    #[arg(long = "scene", value_name = "NAME|FILE")]
+    pub scenes: Vec<String>,
 }
 
 impl Overrides {
@@ -91,7 +95,7 @@ impl Overrides {
             self.settings.iter().map(|text| Setting::parse(text)).collect();
         let mut settings = settings?;
         settings.extend(options);
-        Config::resolve(catalogue, file, &settings)
+        Config::resolve_on(catalogue, file, &settings, &self.scenes)
     }
 }
 
@@ -134,6 +138,7 @@ pub struct BenchArgs {
 #[command(after_help = "\
 Examples:
   cvar-game train --env lava-grid --eta 25 --seed 1 --steps 1000000
+  cvar-game train --env lava-grid --scene detour --eta 25 --seed 1
   cvar-game train --env lava-point --eta 1 --seed 7 --set train.protagonist.minibatch=500 --json")]
 pub struct TrainArgs {
     /// World, such as lava-grid or lava-point.
@@ -382,7 +387,7 @@ pub struct SlurmArgs {
     pub overrides: Overrides,
 }
 
-/// List the worlds with their constants.
+/// List the worlds with their constants, and the scenes on which they can be played.
 #[derive(Debug, Args)]
 pub struct EnvsArgs {
     /// Answer as JSON.
@@ -404,7 +409,7 @@ pub struct PrintArgs {
     #[arg(long)]
     pub env: Option<WorldName>,
     /// Print the annotated default instead: every option with its text, default and range.
-    #[arg(long, conflicts_with_all = ["config", "env", "settings"])]
+    #[arg(long, conflicts_with_all = ["config", "env", "settings", "scenes"])]
     pub default: bool,
     /// Options set on the command line.
     #[command(flatten)]

@@ -11,6 +11,7 @@ use crate::exact::yardstick;
 use crate::experiment::archive;
 use crate::experiment::artefacts::Chance;
 use crate::experiment::config::catalogue::annotated_constants;
+use crate::experiment::config::scenes;
 use crate::experiment::config::{Config, RunConfig, Setting, Shift, Source, WorldConstants};
 use crate::experiment::evaluation;
 use crate::experiment::failure::RunError;
@@ -133,7 +134,10 @@ fn train(registry: &Registry, args: &TrainArgs, stop: &Stop) -> Result<ExitCode>
     let config = args.overrides.resolve(registry.catalogue(), source, options)?;
     let ids = plan::runs(&config);
     let [id] = &ids[..] else {
-        bail!("the configuration has {} variants or methods; use `bench --only RUN_ID`", ids.len());
+        bail!(
+            "the configuration has {} variants, methods or scenes; use `bench --only RUN_ID`",
+            ids.len()
+        );
     };
     let Some(prepared) = stop.interruptible(|| prepare(registry, &config, &ids, &args.out)) else {
         return Ok(report_end(&stopped(stop)));
@@ -316,8 +320,11 @@ fn exact(registry: &Registry, args: &ExactArgs) -> Result<ExitCode> {
         cell: args.cell,
         velocity: args.velocity,
     };
-    let constants = &config.world(&args.env).constants;
-    let watched = Watched::new(&format!("{} at eta {eta}", args.env));
+    let [world] = &config.experiment.envs[..] else {
+        bail!("`exact` answers for one scene; give --scene once");
+    };
+    let constants = &config.world(world).constants;
+    let watched = Watched::new(&format!("{world} at eta {eta}"));
     let found = registry.world(constants)?.solve(constants, gamma, eta, &options, &watched);
     watched.finish();
     let found = found?;
@@ -400,10 +407,19 @@ fn slurm(registry: &Registry, args: &SlurmArgs, program: &Path) -> Result<ExitCo
 fn envs(registry: &Registry, args: &EnvsArgs) -> Result<ExitCode> {
     let catalogue = registry.catalogue();
     if !args.json {
-        let texts: Vec<String> = catalogue.worlds.iter().map(annotated_constants).collect();
+        let mut texts: Vec<String> = catalogue.worlds.iter().map(annotated_constants).collect();
+        texts.push("# Scenes, for `--scene NAME` and as WORLD/NAME:".to_owned());
+        for (name, scene) in scenes::all() {
+            let map = scene.map.to_string();
+            let lines = [format!("{name}: {}", scene.about)]
+                .into_iter()
+                .chain(map.lines().map(str::to_owned));
+            texts.push(lines.map(|line| format!("# {line}\n")).collect());
+        }
         return print(&texts.join("\n"));
     }
-    let config = Config::resolve(catalogue, Source::Default, &[])?;
+    let names: Vec<String> = scenes::all().map(|(name, _)| name.to_owned()).collect();
+    let config = Config::resolve_on(catalogue, Source::Default, &[], &names)?;
     let constants: BTreeMap<_, _> =
         config.base.worlds.values().map(|of| (&of.constants.world, &of.constants.table)).collect();
     print_json(&constants)

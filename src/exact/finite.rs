@@ -281,6 +281,7 @@ fn picture(scene: &Scene) -> Vec<String> {
         let kind = match area.kind {
             AreaKind::Lava => 'L',
             AreaKind::Goal => 'G',
+            AreaKind::LesserGoal => 'g',
             AreaKind::Wall => '#',
         };
         let [x, y] = [0, 1].map(|axis| area.min[axis] as usize..area.max[axis].ceil() as usize);

@@ -83,6 +83,11 @@ pub enum OracleError {
         /// What it may be.
         allowed: String,
     },
+    /// The disc would have to be followed around walls.
+    #[error(
+        "the oracle knows no walls inside the arena; set env.lava-point.walls = [] or use another scene"
+    )]
+    Walls,
     /// The lattice needs too much memory.
     #[error(
         "the oracle's table would take {gibibytes:.1} GiB, more than {MOST_GIBIBYTES}; {advice}"
@@ -424,9 +429,13 @@ impl Problem<'_> {
             return vec![None];
         }
         let horizon = self.config.horizon as usize;
-        let ends = [self.config.goal_reward, self.config.lava_reward];
+        let mut ends = vec![self.config.goal_reward, self.config.lava_reward];
+        if !self.config.lesser_goals.is_empty() {
+            ends.push(self.config.lesser_goal_reward);
+        }
         let mut all: Vec<f64> = (0..horizon)
-            .flat_map(|time| ends.map(|reward| self.rewards.ending(time, reward)))
+            .flat_map(|time| ends.iter().map(move |&reward| (time, reward)))
+            .map(|(time, reward)| self.rewards.ending(time, reward))
             .collect();
         all.push(self.rewards.running[horizon]);
         all.sort_by(f64::total_cmp);
@@ -522,6 +531,9 @@ impl Interval {
 
 fn check(config: &PointConfig, gamma: f64, eta: f64, effort: &Effort) -> Result<f64, OracleError> {
     config.validate()?;
+    if !config.walls.is_empty() {
+        return Err(OracleError::Walls);
+    }
     let alpha = require_eta(eta)?;
     if !(gamma > 0.0 && gamma <= 1.0) {
         return Err(OracleError::Gamma(gamma));

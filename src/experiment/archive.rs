@@ -47,7 +47,7 @@ const LEVEL: i64 = 9;
 /// The name of a run of any program: names of its world, method and variant, budget and seed.
 #[derive(Debug, Clone, PartialEq)]
 pub struct RunName {
-    /// World.
+    /// World, with a `/` and its scene where it is not on its own; in paths the `/` is a `+`.
     pub world: String,
     /// Method of training.
     pub method: String,
@@ -74,7 +74,8 @@ impl RunName {
             [world, method, variant] => (world, *method, Some((*variant).to_owned())),
             _ => return None,
         };
-        Some(RunName { world: (*world).to_owned(), method: method.to_owned(), variant, eta, seed })
+        let world = world.replace('+', "/");
+        Some(RunName { world, method: method.to_owned(), variant, eta, seed })
     }
 
     /// `METHOD` or `METHOD/VARIANT`.
@@ -100,7 +101,8 @@ impl RunName {
 impl fmt::Display for RunName {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let label = if self.is_plain() { String::new() } else { format!("/{}", self.label()) };
-        f.pad(&format!("{}{label}/eta-{}/seed-{}", self.world, self.eta, self.seed))
+        let world = self.world.replace('/', "+");
+        f.pad(&format!("{world}{label}/eta-{}/seed-{}", self.eta, self.seed))
     }
 }
 

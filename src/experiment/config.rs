@@ -15,6 +15,10 @@
 //! where KEY does not begin with a world's name, means that key in every selected world that has it;
 //! `--set` and variants may use it.
 //!
+//! A world may be played on a scene, by the name `WORLD/SCENE`. Its constants are the world's, with those of the
+//! scene below `[env.WORLD]` and the scene's map above it; `[env."WORLD/SCENE"]` wins over all, and may be a scene
+//! of its own.
+//!
 //! | question | module |
 //! |---|---|
 //! | which worlds and methods are there | [`catalogue`] |
@@ -22,6 +26,7 @@
 //! | which layer wins | `layers` |
 //! | what are variants and axes | `variants` |
 //! | what are shifts of constants | `shift` |
+//! | what are scenes | [`scenes`] |
 //! | what does one run's `config.toml` hold, and how is it repeated | `run`, `constants`, `of_run` |
 
 mod annotated;
@@ -34,6 +39,7 @@ mod of_run;
 mod renamed;
 mod rules;
 mod run;
+pub mod scenes;
 mod shift;
 mod variants;
 
@@ -308,6 +314,19 @@ impl Config {
         source: Source<'_>,
         settings: &[Setting],
     ) -> Result<Config, ConfigError> {
+        Config::resolve_on(catalogue, source, settings, &[])
+    }
+
+    /// The same with every selected world on each of these scenes, which are names or files, in place of its own.
+    ///
+    /// # Errors
+    /// As [`Config::resolve`], and if a scene is not there or a world cannot be laid out so.
+    pub fn resolve_on(
+        catalogue: &Catalogue,
+        source: Source<'_>,
+        settings: &[Setting],
+        scenes: &[String],
+    ) -> Result<Config, ConfigError> {
         let schema = catalogue.schema();
         let mut files = vec![Layer::default_of(catalogue)];
         match source {
@@ -319,9 +338,17 @@ impl Config {
         let plain = settings.iter().filter_map(|setting| setting.plain(schema));
         let stack: Vec<Layer> = files.iter().cloned().chain(plain).collect();
         stack.iter().try_for_each(|layer| layer.check(schema))?;
-        let experiment: Experiment = section(&layers::merged(&stack), "experiment")?;
+        let mut experiment: Experiment = section(&layers::merged(&stack), "experiment")?;
         experiment.shifts.iter().try_for_each(|shift| shift.check(schema))?;
-        let drafts = variants::drafts(&stack, &experiment, settings, schema)?;
+        let mut drafts = variants::drafts(&stack, &experiment, settings, schema)?;
+        if !scenes.is_empty() {
+            let layer = scenes::place(scenes, &mut experiment.envs, catalogue)?;
+            layer.check(schema)?;
+            files.push(layer);
+            for draft in &mut drafts {
+                scenes::place(scenes, &mut draft.envs, catalogue)?;
+            }
+        }
 
         let mut selected: Vec<WorldName> = drafts.iter().flat_map(|of| of.envs.clone()).collect();
         if drafts.is_empty() {
@@ -337,7 +364,7 @@ impl Config {
         }
 
         let base = files.iter().chain(&command).cloned().collect::<Vec<_>>();
-        let base = Settings::of(catalogue, &base)?;
+        let base = Settings::of(catalogue, &base, &selected)?;
         if drafts.is_empty() {
             let Experiment { envs, methods, etas, .. } = &experiment;
             base.check(catalogue, (envs, methods, etas), None)?;
@@ -352,7 +379,7 @@ impl Config {
             }
             stack.extend(command.iter().cloned());
             let variants::Draft { name, envs, methods, etas, .. } = draft;
-            let settings = Settings::of(catalogue, &stack)?;
+            let settings = Settings::of(catalogue, &stack, &envs)?;
             settings.check(catalogue, (&envs, &methods, &etas), Some(&name))?;
             variants.push(Variant { name, envs, methods, etas, settings });
         }
@@ -424,14 +451,21 @@ impl Config {
 }
 
 impl Settings {
-    /// The settings of all worlds and methods of the catalogue.
-    fn of(catalogue: &Catalogue, stack: &[Layer]) -> Result<Settings, ConfigError> {
+    /// The settings of all worlds and methods of the catalogue, and of the selected worlds with scenes.
+    fn of(
+        catalogue: &Catalogue,
+        stack: &[Layer],
+        selected: &[WorldName],
+    ) -> Result<Settings, ConfigError> {
         let merged = layers::merged(stack);
         let mut worlds = BTreeMap::new();
-        for WorldInfo { name, .. } in &catalogue.worlds {
-            let train: TrainOptions = typed("train", layers::merged_train(stack, name))?;
-            let world: WorldName = name.parse().map_err(|error| not_a_name(&error))?;
-            let table = layers::constants(&merged, name);
+        let all = catalogue.worlds.iter().map(|world| world.name.parse());
+        let all: Result<Vec<WorldName>, _> = all.collect();
+        let all = all.map_err(|error| not_a_name(&error))?;
+        let with_scenes = selected.iter().filter(|world| world.scene().is_some()).cloned();
+        for world in all.into_iter().chain(with_scenes) {
+            let train: TrainOptions = typed("train", layers::merged_train(stack, &world))?;
+            let table = layers::world_constants(catalogue, stack, &world)?;
             let constants = WorldConstants { world: world.clone(), table }.checked(catalogue)?;
             worlds.insert(world, WorldSettings { constants, train });
         }

@@ -29,8 +29,17 @@ fn checked(name: &str) -> Result<(), NotAName> {
     if fits { Ok(()) } else { Err(NotAName(name.chars().take(LONGEST).collect())) }
 }
 
+/// A world's name, and that of its scene after a `/`. In a folder's name that is a `+`.
+fn checked_world(name: &str) -> Result<(), NotAName> {
+    match name.split_once('/') {
+        None => checked(name),
+        Some((base, scene)) => checked(base).and_then(|()| checked(scene)),
+    }
+    .map_err(|_| NotAName(name.chars().take(LONGEST).collect()))
+}
+
 macro_rules! name {
-    ($(#[$about:meta])* $name:ident) => {
+    ($(#[$about:meta])* $name:ident, $checked:ident) => {
         $(#[$about])*
         #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
         #[serde(try_from = "String", into = "String")]
@@ -53,7 +62,7 @@ macro_rules! name {
             type Err = NotAName;
 
             fn from_str(text: &str) -> Result<Self, NotAName> {
-                checked(text).map(|()| $name(text.to_owned().into()))
+                $checked(text).map(|()| $name(text.to_owned().into()))
             }
         }
 
@@ -98,24 +107,47 @@ macro_rules! name {
 }
 
 name! {
-    /// The name of a world: `lava-grid`.
-    WorldName
+    /// The name of a world: `lava-grid`, or on a scene: `lava-grid/detour`.
+    WorldName, checked_world
 }
 
 name! {
     /// The name of a method of training: `game`.
-    MethodName
+    MethodName, checked
 }
 
 name! {
     /// The name of a variant of an experiment, which differs from it in some options: `k-1`.
-    VariantName
+    VariantName, checked
 }
 
 impl WorldName {
     /// The name of a world of this program.
     pub const fn of<W: World>() -> WorldName {
         WorldName(Cow::Borrowed(W::NAME))
+    }
+
+    /// The world's name without its scene.
+    pub fn base(&self) -> &str {
+        self.0.split_once('/').map_or(&self.0, |(base, _)| base)
+    }
+
+    /// The name of its scene, if it is not the world's own.
+    pub fn scene(&self) -> Option<&str> {
+        self.0.split_once('/').map(|(_, scene)| scene)
+    }
+
+    /// The same world on a scene.
+    ///
+    /// # Errors
+    /// If that is no name.
+    pub fn on(&self, scene: &str) -> Result<WorldName, NotAName> {
+        format!("{}/{scene}", self.base()).parse()
+    }
+
+    /// The name of its folder and files: `lava-grid+detour`.
+    pub fn as_file(&self) -> String {
+        self.0.replace('/', "+")
     }
 }
 
@@ -130,7 +162,7 @@ impl MethodName {
 }
 
 /// Names one run of a sweep: `lava-grid/game/eta-25/seed-3`, and with a variant
-/// `lava-grid/game/k-1/eta-25/seed-3`.
+/// `lava-grid/game/k-1/eta-25/seed-3`, with a scene `lava-grid+detour/game/eta-25/seed-3`.
 #[derive(Debug, Clone, PartialEq)]
 pub struct RunId {
     /// World.
@@ -162,6 +194,7 @@ impl RunId {
     pub fn former_name(&self) -> Option<String> {
         let RunId { world, method, variant, eta, seed } = self;
         let known = *method == MethodName::GAME && variant.is_none();
+        let known = known && world.scene().is_none();
         known.then(|| format!("{world}/eta-{eta}/seed-{seed}"))
     }
 }
@@ -169,6 +202,7 @@ impl RunId {
 impl fmt::Display for RunId {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let RunId { world, method, variant, eta, seed } = self;
+        let world = world.as_file();
         f.pad(&match variant {
             None => format!("{world}/{method}/eta-{eta}/seed-{seed}"),
             Some(variant) => format!("{world}/{method}/{variant}/eta-{eta}/seed-{seed}"),
@@ -197,7 +231,7 @@ impl FromStr for RunId {
                 _ => return None,
             };
             let id = RunId {
-                world: world.parse().ok()?,
+                world: world.replace('+', "/").parse().ok()?,
                 method: method.map_or(Ok(MethodName::GAME), str::parse).ok()?,
                 variant: variant.map(str::parse).transpose().ok()?,
                 eta: eta.strip_prefix("eta-")?.parse().ok()?,

@@ -105,7 +105,7 @@ impl Registry {
     /// # Errors
     /// If this program has no world of that name.
     pub fn world(&self, of: &WorldConstants) -> Result<&dyn Entry, RunError> {
-        let name = of.world.as_str();
+        let name = of.world.base();
         self.named(name).ok_or_else(|| RunError::UnknownWorld(name.to_owned()))
     }
 
@@ -114,9 +114,10 @@ impl Registry {
         self.worlds.iter().find_map(|world| (&**world as &dyn Any).downcast_ref())
     }
 
-    /// The world of a name, if there is one.
+    /// The world of a name, on whatever scene, if there is one.
     pub fn named(&self, name: &str) -> Option<&dyn Entry> {
-        self.worlds.iter().find(|world| world.name() == name).map(Box::as_ref)
+        let base = name.split_once('/').map_or(name, |(base, _)| base);
+        self.worlds.iter().find(|world| world.name() == base).map(Box::as_ref)
     }
 }
 

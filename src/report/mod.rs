@@ -31,7 +31,7 @@ pub mod table;
 
 pub use render::screen_width;
 
-use crate::experiment::config::RunConfig;
+use crate::experiment::config::{RunConfig, scenes};
 use crate::experiment::failure::RunError;
 use crate::experiment::registry::{Limits, Registry};
 use crate::files::write_in_place;
@@ -122,8 +122,8 @@ impl Worlds for Registry {
     }
 
     fn constants(&self, world: &str, given: &toml::Table) -> Option<toml::Table> {
-        let world = self.named(world)?.info();
-        let mut table: toml::Table = toml::from_str(world.defaults).ok()?;
+        let (name, world) = (world.parse().ok()?, self.named(world)?.info());
+        let mut table = scenes::defaults(&world, &name)?;
         table.extend(given.clone());
         (world.check)(table).ok()
     }

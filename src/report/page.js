@@ -87,7 +87,7 @@ if (data) {
     const at = ([x, y]) => [(x + offset) * unit, (y + offset) * unit];
     context.clearRect(0, 0, canvas.width, canvas.height);
     for (const { kind, min, max } of scene.areas) {
-      context.fillStyle = { lava: "#d55e00", goal: "#009e73", wall: ink }[kind];
+      context.fillStyle = { lava: "#d55e00", goal: "#009e73", "lesser-goal": "#7fceb9", wall: ink }[kind];
       context.fillRect(min[0] * unit, min[1] * unit, (max[0] - min[0]) * unit, (max[1] - min[1]) * unit);
     }
     context.lineWidth = 2;

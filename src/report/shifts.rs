@@ -181,7 +181,7 @@ fn drawn(judged: &[Judged<'_>]) -> Vec<Figure> {
             caption += " Dashed: the best policy of each value.";
         }
         Some(Figure {
-            name: format!("{world}-{constant}-eta-{eta}"),
+            name: format!("{}-{constant}-eta-{eta}", world.replace('/', "+")),
             title: format!("{world}, eta = {eta}: another {constant} than in training"),
             caption,
             picture,

@@ -1,9 +1,17 @@
 //! Constants of `lava-point`, in metres, seconds and kilograms.
 
-use super::LavaPoint;
+use super::geometry::Scene;
+use super::{LavaPoint, vector};
 use crate::error::{ConfigError, require, require_rewards};
-use crate::world::World;
+use crate::map::{Map, Tile};
+use crate::world::{End, World};
 use serde::{Deserialize, Serialize};
+
+/// Most rectangles of one kind.
+const MOST_RECTANGLES: usize = 10_000;
+
+/// Points across the longer side of the lattice on which ways to a goal are looked for, where the disc is small.
+const WAYS_ACROSS: f64 = 500.0;
 
 /// The constants, with what they mean, their defaults and their ranges.
 pub const DEFAULTS: &str = r#"# lava-point: a disc is pushed past the same lava, in metres and seconds; x to the right, y downward.
@@ -53,6 +61,10 @@ step_cost = 0.035
 # Range: [-1000000, 1000000]
 goal_reward = 1.0
 
+# Reward on reaching a lesser goal, which ends the episode too.
+# Range: [-1000000, 1000000]
+lesser_goal_reward = 0.5
+
 # Reward on touching lava, which ends the episode.
 # Range: [-1000000, 1000000]
 lava_reward = -1.0
@@ -60,6 +72,18 @@ lava_reward = -1.0
 # Time limit T in control steps. A true end of the episode, as on the grid.
 # Range: [1, 1000000]
 horizon = 40
+
+# More lava: a list of rectangles [x_min, y_min, x_max, y_max], in m.
+more_lava = []
+
+# More goal regions, likewise.
+more_goals = []
+
+# Goal regions that pay lesser_goal_reward, likewise.
+lesser_goals = []
+
+# Walls inside the arena, likewise. A disc slides along them.
+walls = []
 
 # The lava, a rectangle inside the arena.
 [lava]
@@ -139,10 +163,44 @@ pub struct PointConfig {
     pub step_cost: f64,
     /// Reward on reaching the goal.
     pub goal_reward: f64,
+    /// Reward on reaching a lesser goal. The default is not written, so that certificates of worlds without lesser
+    /// goals do not depend on it.
+    #[serde(default = "lesser_goal_reward", skip_serializing_if = "is_the_default")]
+    pub lesser_goal_reward: f64,
     /// Reward on touching lava.
     pub lava_reward: f64,
     /// Time limit T in control steps.
     pub horizon: u32,
+    /// More lava, as [x_min, y_min, x_max, y_max] in m.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub more_lava: Vec<Corners>,
+    /// More goal regions.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub more_goals: Vec<Corners>,
+    /// Goal regions that pay [`PointConfig::lesser_goal_reward`].
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub lesser_goals: Vec<Corners>,
+    /// Walls inside the arena.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub walls: Vec<Corners>,
+}
+
+/// A rectangle as [x_min, y_min, x_max, y_max] in m.
+pub type Corners = [f64; 4];
+
+impl From<Corners> for Rectangle {
+    fn from([left, top, right, bottom]: Corners) -> Rectangle {
+        Rectangle { min: [left, top], max: [right, bottom] }
+    }
+}
+
+/// The default of [`PointConfig::lesser_goal_reward`].
+fn lesser_goal_reward() -> f64 {
+    0.5
+}
+
+fn is_the_default(reward: &f64) -> bool {
+    *reward == lesser_goal_reward()
 }
 
 impl Default for PointConfig {
@@ -177,7 +235,24 @@ impl PointConfig {
                 return Err(ConfigError::value("arena", self.arena, allowed));
             }
         }
-        for (field, rectangle) in [("lava", self.lava), ("goal", self.goal)] {
+        let listed = [
+            ("more_lava", &self.more_lava),
+            ("more_goals", &self.more_goals),
+            ("lesser_goals", &self.lesser_goals),
+            ("walls", &self.walls),
+        ];
+        for (field, list) in listed {
+            if list.len() > MOST_RECTANGLES {
+                let allowed = format!("at most {MOST_RECTANGLES} rectangles");
+                return Err(ConfigError::value(field, list.len(), &*allowed));
+            }
+        }
+        let listed = listed
+            .into_iter()
+            .flat_map(|(field, list)| list.iter().map(move |&of| (field, of.into())));
+        for (field, rectangle) in
+            [("lava", self.lava), ("goal", self.goal)].into_iter().chain(listed)
+        {
             let fits = (0..2).all(|axis| {
                 let (min, max) = (rectangle.min[axis], rectangle.max[axis]);
                 0.0 <= min && min < max && max <= self.arena[axis]
@@ -204,9 +279,12 @@ impl PointConfig {
             let allowed = format!("the disc of radius {radius} m must lie in the arena");
             return Err(ConfigError::value("start", self.start, allowed));
         }
-        if distance(self.start, self.lava) <= radius || distance(self.start, self.goal) == 0.0 {
+        let touches = |area: Rectangle| distance(self.start, area) <= radius;
+        if self.lava().chain(self.walls()).any(touches)
+            || self.goals().any(|(goal, _)| distance(self.start, goal) == 0.0)
+        {
             let allowed =
-                "the disc must touch neither the lava nor, with its centre, the goal region";
+                "the disc must touch neither lava nor walls nor, with its centre, a goal region";
             return Err(ConfigError::value("start", self.start, allowed));
         }
         require("mass", self.mass, |m| (1e-3..=1e3).contains(&m), "in [0.001, 1000] kg")?;
@@ -224,12 +302,80 @@ impl PointConfig {
         }
         let retention = |share: f64| (1e-3..=1.0).contains(&share);
         require("velocity_retention", self.velocity_retention, retention, "in [0.001, 1]")?;
-        require_rewards(self.step_cost, self.goal_reward, self.lava_reward, self.horizon)
+        let rewards = [self.goal_reward, self.lesser_goal_reward, self.lava_reward];
+        require_rewards(self.step_cost, rewards, self.horizon)
     }
 
-    /// Whether the disc can come to the goal region and touch no lava. The lava is convex: where it does not
-    /// reach from wall to wall, there is a way around it.
+    /// All lava.
+    pub fn lava(&self) -> impl Iterator<Item = Rectangle> + '_ {
+        std::iter::once(self.lava).chain(self.more_lava.iter().map(|&of| of.into()))
+    }
+
+    /// All goal regions, each with its reward.
+    pub fn goals(&self) -> impl Iterator<Item = (Rectangle, f64)> + '_ {
+        let goals = std::iter::once(self.goal).chain(self.more_goals.iter().map(|&of| of.into()));
+        let lesser = self.lesser_goals.iter().map(|&of| (of.into(), self.lesser_goal_reward));
+        goals.map(|goal| (goal, self.goal_reward)).chain(lesser)
+    }
+
+    /// All walls inside the arena.
+    pub fn walls(&self) -> impl Iterator<Item = Rectangle> + '_ {
+        self.walls.iter().map(|&of| of.into())
+    }
+
+    /// Whether the disc can come to a goal region and touch no lava.
     fn goal_can_be_reached(&self) -> bool {
+        let one_of_each = [&self.more_lava, &self.more_goals, &self.lesser_goals, &self.walls]
+            .iter()
+            .all(|list| list.is_empty());
+        if one_of_each { self.goal_is_beside_lava() } else { self.a_goal_is_connected() }
+    }
+
+    /// Whether steps between the points of a lattice lead to a goal, past lava and walls. A way that is narrower than
+    /// the lattice may be missed.
+    fn a_goal_is_connected(&self) -> bool {
+        let scene = Scene::new(self);
+        let room = self.arena.map(|side| side - 2.0 * self.radius);
+        let spacing = self.radius.max(room[0].max(room[1]) / WAYS_ACROSS);
+        let counts = room.map(|side| (side / spacing).ceil() as usize);
+        // The lattice goes through the start, so that a start in a narrow place is on it.
+        let at = |[x, y]: [usize; 2]| {
+            let along = |axis: usize, index: usize| {
+                let first = (self.start[axis] - self.radius) % spacing;
+                (self.radius + first + index as f64 * spacing).min(self.arena[axis] - self.radius)
+            };
+            vector([along(0, x), along(1, y)])
+        };
+        let index = |axis: usize| ((self.start[axis] - self.radius) / spacing) as usize;
+        let begin = [index(0), index(1)];
+        let mut seen = vec![false; (counts[0] + 1) * (counts[1] + 1)];
+        let mut waiting = vec![begin];
+        seen[begin[0] * (counts[1] + 1) + begin[1]] = true;
+        while let Some([x, y]) = waiting.pop() {
+            let near = [[x.wrapping_sub(1), y], [x + 1, y], [x, y.wrapping_sub(1)], [x, y + 1]];
+            for next in near {
+                if next[0] > counts[0] || next[1] > counts[1] {
+                    continue;
+                }
+                let (from, to) = (at([x, y]), at(next));
+                match scene.impact(from, to) {
+                    Some((_, End::Goal, _)) if !scene.is_blocked(from, to) => return true,
+                    None if !scene.is_blocked(from, to) => {
+                        let place = &mut seen[next[0] * (counts[1] + 1) + next[1]];
+                        if !std::mem::replace(place, true) {
+                            waiting.push(next);
+                        }
+                    }
+                    _ => {}
+                }
+            }
+        }
+        false
+    }
+
+    /// The same where there is one rectangle of lava and one of goal. The lava is convex: where it does not
+    /// reach from wall to wall, there is a way around it.
+    fn goal_is_beside_lava(&self) -> bool {
         let PointConfig { arena, lava, goal, start, radius, .. } = self;
         // The farthest points from the lava are corners of what the centre can reach of the goal.
         let side = |axis: usize| {
@@ -256,6 +402,37 @@ impl PointConfig {
     pub fn substep(&self) -> f64 {
         self.control_step / f64::from(self.substeps)
     }
+}
+
+/// See [`World::of_map`].
+pub(super) fn of_map(map: &Map) -> Result<toml::Table, String> {
+    let metres = |tile| -> Vec<Corners> {
+        map.rectangles(tile).into_iter().map(|of| of.map(|cells| cells as f64)).collect()
+    };
+    let (lava, goals) = (metres(Tile::Lava), metres(Tile::Goal));
+    let first = |of: &[Corners], missing: &str| {
+        let [left, top, right, bottom] = *of.first().ok_or(missing)?;
+        let corners = [
+            ("min".to_owned(), vec![left, top].into()),
+            ("max".to_owned(), vec![right, bottom].into()),
+        ];
+        Ok::<_, String>(toml::Value::Table(corners.into_iter().collect()))
+    };
+    let list = |of: &[Corners]| -> toml::Value {
+        of.iter().map(|corners| corners.to_vec()).collect::<Vec<_>>().into()
+    };
+    let (x, y) = map.coordinates(map.start());
+    let constants = [
+        ("arena", vec![map.width() as f64, map.height() as f64].into()),
+        ("start", vec![x as f64 + 0.5, y as f64 + 0.5].into()),
+        ("lava", first(&lava, "the map has no lava `L`")?),
+        ("goal", first(&goals, "the map has no goal `G`")?),
+        ("more_lava", list(&lava[1..])),
+        ("more_goals", list(&goals[1..])),
+        ("lesser_goals", list(&metres(Tile::LesserGoal))),
+        ("walls", list(&metres(Tile::Wall))),
+    ];
+    Ok(constants.into_iter().map(|(name, value)| (name.to_owned(), value)).collect())
 }
 
 /// Distance from a point to a rectangle, 0 inside.

@@ -306,8 +306,7 @@ impl Physics {
                 self.seated.push(slot);
             } else {
                 let Body { position, velocity } = self.moved(*body);
-                // Rapier adds its (absent) forces, which turns -0 into 0.
-                *body = Body { position, velocity: (velocity + Vector::ZERO) * self.retention };
+                *body = Body { position, velocity: self.damped(velocity) };
             }
         }
         for group in self.seated.chunks(self.seats.len()) {
@@ -322,6 +321,22 @@ impl Physics {
                 bodies[slot] = Body { position: rigid.translation(), velocity: rigid.linvel() };
             }
         }
+    }
+
+    /// Length of a substep in s.
+    pub fn dt(&self) -> f32 {
+        self.paths.dt
+    }
+
+    /// A velocity, shortened to the speed limit.
+    pub fn limited(&self, velocity: Vector) -> Vector {
+        velocity.clamp_length_max(self.speed_limit)
+    }
+
+    /// The velocity after the damping of a substep.
+    pub fn damped(&self, velocity: Vector) -> Vector {
+        // Rapier adds its (absent) forces, which turns -0 into 0.
+        (velocity + Vector::ZERO) * self.retention
     }
 
     /// A body after a substep, before damping.

@@ -166,12 +166,14 @@ pub enum Scripted {
 }
 
 impl Scripted {
-    /// The yardsticks of a world; clearances are multiples of half a metre that fit in the arena.
+    /// The yardsticks of a world; clearances are multiples of half a metre that fit in the arena, where there is one
+    /// rectangle of lava to go around.
     pub fn all(config: &PointConfig) -> Vec<Scripted> {
         let mut all =
             vec![Scripted::StandStill, Scripted::Random, Scripted::Straight(config.clone())];
         let free = config.arena[1] - config.lava.max[1] - 2.0 * config.radius;
-        let clearances = (1..=8).map(|k| 0.5 * f64::from(k)).filter(|&c| c <= free);
+        let alone = config.more_lava.is_empty();
+        let clearances = (1..=8).map(|k| 0.5 * f64::from(k)).filter(|&c| alone && c <= free);
         all.extend(clearances.map(|c| Scripted::Clearance(config.clone(), c)));
         all
     }

@@ -96,9 +96,9 @@ pub struct Landing {
     pub velocity: usize,
 }
 
-/// Shares of the cells of v+ that end, as counts of sub-samples: lava in the high, goal in the low
-/// half of the byte.
-pub type Events = Vec<u8>;
+/// Shares of the cells of v+ that end, as counts of sub-samples: lava in the lowest four bits, goals in the next four,
+/// lesser goals in the next.
+pub type Events = Vec<u16>;
 
 /// A lattice laid over a world.
 #[derive(Debug, Clone)]
@@ -118,7 +118,7 @@ pub struct Space {
     /// Displacement in s per unit of v+.
     pub reach: f64,
     /// Which end a node itself is, by `x * ny + y`.
-    pub stopped: Vec<Option<End>>,
+    pub stopped: Vec<Option<Ending>>,
     /// Shares of ends by node; empty where no velocity of the lattice ends.
     pub events: Vec<Events>,
     /// Landings by `axis`, then `node * (2 plus + 1) + velocity`.
@@ -188,8 +188,8 @@ impl Space {
         let Halves { mean, plus, .. } = Halves::new(config, lattice.velocity);
         let square = |half: usize| (2.0 * half as f64 + 1.0).powi(2);
         let table = f64::from(config.horizon) * square(mean) * 4.0;
-        // V of two times in single precision, and the shares of ends in bytes.
-        nodes(0) * nodes(1) * (table + square(plus) * 9.0)
+        // V of two times in single precision, and the shares of ends in two bytes.
+        nodes(0) * nodes(1) * (table + square(plus) * 10.0)
     }
 
     /// Weights of four nodes for interpolation in velocity, at `share` between the middle ones.
@@ -285,11 +285,8 @@ impl Space {
                 for dx in &offsets {
                     for dy in &offsets {
                         let velocity = [self.plus(i) + dx, self.plus(j) + dy];
-                        code += match scene.step(position, velocity).end {
-                            Some(End::Lava) => 16,
-                            Some(End::Goal) => 1,
-                            _ => 0,
-                        };
+                        let end = scene.step(position, velocity).end;
+                        code += end.map_or(0, |end| 1 << (4 * end as u16));
                     }
                 }
                 events.push(code);
@@ -326,11 +323,25 @@ fn kernel(ratio: f64, wide: usize) -> Vec<f32> {
     nodes.map(|m| (weight(m) / total) as f32).collect()
 }
 
-/// Shares of lava and goal in a code of [`Events`].
-pub fn shares(code: u8) -> (f32, f32) {
+/// Shares of the ends in a code of [`Events`], by [`Ending`].
+pub fn shares(code: u16) -> [f32; ENDINGS] {
     let all = (SAMPLES * SAMPLES) as f32;
-    (f32::from(code >> 4) / all, f32::from(code & 15) / all)
+    std::array::from_fn(|end| f32::from(code >> (4 * end) & 15) / all)
 }
+
+/// What a place of the arena ends an episode with.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Ending {
+    /// Lava.
+    Lava,
+    /// A goal.
+    Goal,
+    /// A goal that pays the lesser reward.
+    LesserGoal,
+}
+
+/// Number of [`Ending`]s.
+pub const ENDINGS: usize = 3;
 
 /// What a control step leads to once v+ is fixed.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -339,15 +350,15 @@ pub struct Moved {
     pub position: [f64; 2],
     /// Velocity after damping, in m/s.
     pub velocity: [f64; 2],
-    /// Lava or goal, if the step ends there.
-    pub end: Option<End>,
+    /// What the step ends in, if it does.
+    pub end: Option<Ending>,
 }
 
 /// Lava, goal and walls, as the DP sees them, and how a disc moves among them.
 #[derive(Debug, Clone)]
 pub struct Scene {
-    lava: Rectangle,
-    goal: Rectangle,
+    lava: Vec<Rectangle>,
+    goals: Vec<(Rectangle, Ending)>,
     radius: f64,
     /// Where the centre may be, by axis.
     room: [[f64; 2]; 2],
@@ -362,12 +373,14 @@ pub struct Scene {
 impl Scene {
     /// The scene of a valid configuration.
     pub fn new(config: &PointConfig) -> Scene {
-        let Rectangle { min, max } = config.goal;
-        let goal = Rectangle { min: min.map(|c| c + SLACK), max: max.map(|c| c - SLACK) };
+        let goal = |(Rectangle { min, max }, reward): (Rectangle, f64)| {
+            let inner = Rectangle { min: min.map(|c| c + SLACK), max: max.map(|c| c - SLACK) };
+            (inner, if reward == config.goal_reward { Ending::Goal } else { Ending::LesserGoal })
+        };
         let left = config.velocity_retention.powf(1.0 / f64::from(config.substeps));
         Scene {
-            lava: config.lava,
-            goal,
+            lava: config.lava().collect(),
+            goals: config.goals().map(goal).collect(),
             radius: config.radius - SLACK,
             room: config.arena.map(|side| [config.radius, side - config.radius]),
             substeps: config.substeps,
@@ -378,7 +391,7 @@ impl Scene {
     }
 
     /// Which end a centre at rest is in.
-    pub fn end_at(&self, position: [f64; 2]) -> Option<End> {
+    pub fn end_at(&self, position: [f64; 2]) -> Option<Ending> {
         self.first_end(position, [0.0, 0.0]).map(|(_, end)| end)
     }
 
@@ -390,7 +403,8 @@ impl Scene {
                 && y[0] <= rectangle.max[1] + margin
                 && y[1] >= rectangle.min[1] - margin
         };
-        meets(&self.lava, self.radius) || meets(&self.goal, 0.0)
+        self.lava.iter().any(|lava| meets(lava, self.radius))
+            || self.goals.iter().any(|(goal, _)| meets(goal, 0.0))
     }
 
     /// One control step from a velocity after the noise.
@@ -423,7 +437,7 @@ impl Scene {
     }
 
     /// The first end on a straight path, with its share of the path; lava if both coincide.
-    fn first_end(&self, from: [f64; 2], path: [f64; 2]) -> Option<(f64, End)> {
+    fn first_end(&self, from: [f64; 2], path: [f64; 2]) -> Option<(f64, Ending)> {
         let line = |axis: usize| {
             let (a, b) = (from[axis], from[axis] + path[axis]);
             [a.min(b), a.max(b)]
@@ -431,24 +445,38 @@ impl Scene {
         if !self.may_end([line(0), line(1)]) {
             return None;
         }
-        let lava = self.time_to_lava(from, path);
-        let goal = time_to_box(from, path, self.goal.min, self.goal.max);
-        match (lava, goal) {
-            (Some(lava), Some(goal)) if goal < lava => Some((goal, End::Goal)),
-            (Some(lava), _) => Some((lava, End::Lava)),
-            (None, goal) => goal.map(|time| (time, End::Goal)),
-        }
+        let lava = self.lava.iter().filter_map(|&lava| self.time_to_lava(lava, from, path));
+        let lava = lava.min_by(f64::total_cmp).map(|time| (time, Ending::Lava));
+        let goals = self.goals.iter().filter_map(|&(Rectangle { min, max }, ending)| {
+            time_to_box(from, path, min, max).map(|time| (time, ending))
+        });
+        // The first of equal ones is the least.
+        lava.into_iter().chain(goals).min_by(|a, b| a.0.total_cmp(&b.0))
     }
 
     /// The centre touches lava in the rectangle grown in x, the one grown in y, or the discs at the
     /// corners.
-    fn time_to_lava(&self, from: [f64; 2], path: [f64; 2]) -> Option<f64> {
-        let (Rectangle { min, max }, r) = (self.lava, self.radius);
+    fn time_to_lava(
+        &self,
+        Rectangle { min, max }: Rectangle,
+        from: [f64; 2],
+        path: [f64; 2],
+    ) -> Option<f64> {
+        let r = self.radius;
         let grown_x = time_to_box(from, path, [min[0] - r, min[1]], [max[0] + r, max[1]]);
         let grown_y = time_to_box(from, path, [min[0], min[1] - r], [max[0], max[1] + r]);
         let corners = [min, [min[0], max[1]], [max[0], min[1]], max];
         let corners = corners.iter().filter_map(|&corner| time_to_disc(from, path, corner, r));
         grown_x.into_iter().chain(grown_y).chain(corners).min_by(f64::total_cmp)
+    }
+}
+
+impl From<Ending> for End {
+    fn from(ending: Ending) -> End {
+        match ending {
+            Ending::Lava => End::Lava,
+            Ending::Goal | Ending::LesserGoal => End::Goal,
+        }
     }
 }
 

@@ -17,10 +17,10 @@
 //! Work is split by columns of the position lattice, each of which reads the later V and writes its
 //! own part: the result does not depend on the number of threads.
 
-use super::lattice::{Halves, Space, cubic, shares};
+use super::lattice::{ENDINGS, Halves, Space, cubic, shares};
 use crate::exact::watch::Watch;
 use crate::game::columns::{Loops, widest};
-use lava_envs::{End, PointConfig};
+use lava_envs::PointConfig;
 use std::sync::Mutex;
 
 /// What is maximised in expectation.
@@ -183,10 +183,8 @@ pub fn sweep(
     let mut now = vec![0.0_f32; nx * slab];
     for time in (0..horizon).rev() {
         let config = &space.config;
-        let ends = Ends {
-            lava: utility.of(rewards.ending(time, config.lava_reward)) as f32,
-            goal: utility.of(rewards.ending(time, config.goal_reward)) as f32,
-        };
+        let ends = [config.lava_reward, config.goal_reward, config.lesser_goal_reward]
+            .map(|reward| utility.of(rewards.ending(time, reward)) as f32);
         let place = if keep { time } else { 0 };
         let here = &mut means[place * nx * column..][..nx * column];
         let columns = here.chunks_mut(column).zip(now.chunks_mut(slab)).enumerate();
@@ -226,12 +224,8 @@ fn limited([a, b, c, d]: [f32; 4], weights: [f32; 4]) -> f32 {
     cubic.clamp(b.min(c), b.max(c))
 }
 
-/// Utilities of the ends at one time.
-#[derive(Debug, Clone, Copy)]
-struct Ends {
-    lava: f32,
-    goal: f32,
-}
+/// Utilities of the ends at one time, by [`super::lattice::Ending`].
+type Ends = [f32; ENDINGS];
 
 /// Numbers that are computed at once: an arithmetic operation on an array of them is one on a vector register.
 const LANES: usize = 8;
@@ -400,7 +394,7 @@ impl Loops for Column<'_> {
             let node = x * ny + y;
             let means = &mut means[y * mean * mean..][..mean * mean];
             if let Some(end) = space.stopped[node] {
-                let value = if end == End::Lava { ends.lava } else { ends.goal };
+                let value = ends[end as usize];
                 means.fill(value);
                 for i in 0..plus {
                     values[(i * ny + y) * plus..][..plus].fill(value);
@@ -412,9 +406,12 @@ impl Loops for Column<'_> {
             for (row, codes) in outcomes.chunks_exact_mut(wide_plus).zip(codes) {
                 for (outcome, &code) in row.iter_mut().zip(codes) {
                     if code != 0 {
-                        let (lava, goal) = shares(code);
-                        *outcome =
-                            *outcome * (1.0 - lava - goal) + ends.lava * lava + ends.goal * goal;
+                        let shares = shares(code);
+                        let goes_on = 1.0 - shares[0] - shares[1] - shares[2];
+                        *outcome *= goes_on;
+                        for (share, end) in shares.iter().zip(ends) {
+                            *outcome += end * share;
+                        }
                     }
                 }
             }

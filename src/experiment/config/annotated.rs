@@ -2,6 +2,7 @@
 
 use super::rules::{self, Rule};
 use super::{ConfigError, keys, renamed};
+use std::borrow::Cow;
 use std::collections::BTreeMap;
 use toml::{Table, Value};
 
@@ -41,7 +42,7 @@ impl Schema {
     /// What to write instead of an unknown key: its present name, or the nearest known key by edit
     /// distance of the last part, then of the whole.
     pub(super) fn advice(&self, key: &str) -> String {
-        if let Some(present) = renamed::present(self.canonical(key)) {
+        if let Some(present) = renamed::present(&self.canonical(key)) {
             return format!("it was renamed to {present}");
         }
         let last = |key: &str| key.rsplit('.').next().unwrap_or_default().to_owned();
@@ -77,8 +78,9 @@ impl Schema {
                     let rule = Rule::read(comment, value).map_err(|why| format!("{key}: {why}"))?;
                     let stated = comment.is_some_and(Rule::is_stated);
                     // Lists of numbers in a world or a method are points and have their length; those
-                    // of the experiment are sets.
+                    // of the experiment are sets. A list that is empty by default may have any.
                     let length = match value {
+                        Value::Array(of) if of.is_empty() => None,
                         Value::Array(of) if key.starts_with("env.") => Some(of.len()),
                         Value::Array(of) if key.starts_with("method.") => Some(of.len()),
                         _ => None,
@@ -93,7 +95,7 @@ impl Schema {
         }
         let schema = Schema { table, options };
         for (key, value) in keys::leaves(&schema.table) {
-            let known = value.is_table() || schema.options.contains_key(schema.canonical(&key));
+            let known = value.is_table() || schema.options.contains_key(&*schema.canonical(&key));
             known.then_some(()).ok_or(format!("{key} has no line of its own"))?;
         }
         Ok(schema)
@@ -116,15 +118,15 @@ impl Schema {
 
     /// The default's value of a key; a world's own `train` section has the keys of `[train]`.
     pub fn lookup(&self, key: &str) -> Option<&Value> {
-        keys::at(&self.table, self.canonical(key))
+        keys::at(&self.table, &self.canonical(key))
     }
 
-    /// `train.KEY` for `env.WORLD.train.KEY`, and any other key itself.
-    pub fn canonical<'a>(&self, key: &'a str) -> &'a str {
+    /// `train.KEY` for `env.WORLD.train.KEY`, `env.WORLD.KEY` for `env.WORLD/SCENE.KEY`, and any other key itself.
+    pub fn canonical<'a>(&self, key: &'a str) -> Cow<'a, str> {
         canonical(&self.table, key)
     }
 
-    /// Whether there is a world of this name.
+    /// Whether there is a world of this name, with or without a scene.
     pub fn has_world(&self, name: &str) -> bool {
         has_world(&self.table, name)
     }
@@ -141,7 +143,7 @@ impl Schema {
         if rules::alike(value, example) {
             return self.check_range(key, value, origin);
         }
-        let allowed = match (example, self.options.get(self.canonical(key))) {
+        let allowed = match (example, self.options.get(&*self.canonical(key))) {
             (Value::Array(_), _) => format!("a list, such as {example}"),
             (Value::Table(section), _) => {
                 let first = section.keys().next().map_or("", String::as_str);
@@ -155,7 +157,7 @@ impl Schema {
 
     /// Refuses a value out of range; a key without a rule may be anything.
     pub fn check_range(&self, key: &str, value: &Value, origin: &str) -> Result<(), ConfigError> {
-        self.check_as(self.canonical(key), key, value, origin)
+        self.check_as(&self.canonical(key), key, value, origin)
     }
 
     /// Checks the value of a key by the rule of another one, `ruling`.
@@ -183,15 +185,19 @@ impl Schema {
 }
 
 fn has_world(table: &Table, name: &str) -> bool {
-    table.get("env").and_then(|worlds| worlds.get(name)).is_some()
+    let base = name.split_once('/').map_or(name, |(base, _)| base);
+    table.get("env").and_then(|worlds| worlds.get(base)).is_some()
 }
 
-fn canonical<'a>(table: &Table, key: &'a str) -> &'a str {
-    match key.strip_prefix("env.").and_then(|rest| rest.split_once('.')) {
-        Some((world, rest)) if rest == "train" || rest.starts_with("train.") => {
-            if has_world(table, world) { rest } else { key }
-        }
-        _ => key,
+fn canonical<'a>(table: &Table, key: &'a str) -> Cow<'a, str> {
+    let parts = key.strip_prefix("env.").and_then(|rest| rest.split_once('.'));
+    let Some((world, rest)) = parts.filter(|(world, _)| has_world(table, world)) else {
+        return key.into();
+    };
+    match world.split_once('/') {
+        _ if rest == "train" || rest.starts_with("train.") => rest.into(),
+        Some((base, _)) => format!("env.{base}.{rest}").into(),
+        None => key.into(),
     }
 }
 

@@ -9,6 +9,7 @@ use crate::experiment::names::{MethodName, WorldName};
 use crate::game::budget::Eta;
 use crate::learn::options::TrainOptions;
 use lava_envs::World;
+use lava_envs::map::Map;
 use toml::Table;
 
 /// The part of the annotated default that does not belong to a world or a method.
@@ -25,6 +26,8 @@ pub struct WorldInfo {
     pub training: &'static str,
     /// Checks constants and returns them in the order of their type, with defaults for absent ones.
     pub check: fn(Table) -> Result<Table, String>,
+    /// [`World::of_map`].
+    pub of_map: fn(&Map) -> Result<Table, String>,
     /// For each method, what refuses options with which it cannot train here.
     pub methods: Vec<MethodChecks>,
 }
@@ -47,6 +50,7 @@ impl WorldInfo {
             name: W::NAME,
             defaults: W::DEFAULTS,
             training: W::TRAINING,
+            of_map: W::of_map,
             check: |table| {
                 let constants = constants_of::<W>(table)?;
                 Table::try_from(constants).map_err(|error| one_line(&error.to_string()))
@@ -100,11 +104,19 @@ impl Catalogue {
             words.map(|word| format!("{word:?}")).collect::<Vec<_>>().join(", ")
         };
         let names: Vec<&str> = worlds.iter().map(|of| of.name).collect();
+        let with_scenes = names.iter().map(|name| format!("{name}/SCENE"));
+        let listed_worlds: Vec<String> = names
+            .iter()
+            .map(|&name| name.to_owned())
+            .chain(with_scenes)
+            .map(|name| format!("{name:?}"))
+            .collect();
+        let listed_worlds = listed_worlds.join(", ");
         let first: Vec<&str> = methods.iter().map(|of| of.name).take(1).collect();
         let mut annotated = GENERAL
             .replace("envs = [\"lava-grid\", \"lava-point\"]", &format!("envs = {names:?}"))
             .replace("methods = [\"game\"]", &format!("methods = {first:?}"))
-            .replace("the worlds of the program", &words(&mut worlds.iter().map(|of| of.name)))
+            .replace("the worlds of the program", &listed_worlds)
             .replace("the methods of the program", &words(&mut methods.iter().map(|of| of.name)))
             .replace("the families of the program", &words(&mut families.iter().copied()));
         for method in methods.iter().filter(|method| !method.defaults.is_empty()) {
@@ -138,12 +150,12 @@ impl Catalogue {
         self.schema.options()
     }
 
-    /// A world by its name.
+    /// A world by its name, whatever its scene.
     ///
     /// # Errors
     /// If there is no such name.
     pub fn world(&self, name: &WorldName) -> Result<&WorldInfo, ConfigError> {
-        self.worlds.iter().find(|world| *name == world.name).ok_or_else(|| {
+        self.worlds.iter().find(|world| name.base() == world.name).ok_or_else(|| {
             let names: Vec<&str> = self.worlds.iter().map(|world| world.name).collect();
             ConfigError::UnknownName {
                 kind: "world",

@@ -25,7 +25,7 @@ impl WorldConstants {
     /// # Errors
     /// If these are another world's, or the world refuses them.
     pub fn of<W: World>(&self) -> Result<W::Constants, ConfigError> {
-        if self.world != W::NAME {
+        if self.world.base() != W::NAME {
             return Err(self.refused(format!("{} was expected", W::NAME)));
         }
         constants_of::<W>(self.table.clone()).map_err(|message| self.refused(message))

@@ -3,7 +3,7 @@
 use super::annotated::Schema;
 use super::keys::{at, leaves, merge, nested};
 use super::of_run::as_experiment;
-use super::{Catalogue, ConfigError, one_line};
+use super::{Catalogue, ConfigError, one_line, scenes};
 use crate::experiment::names::WorldName;
 use crate::files::read_text;
 use std::path::{Path, PathBuf};
@@ -250,12 +250,14 @@ pub(super) fn merged(stack: &[Layer]) -> Table {
     table
 }
 
-/// The training options of a world: per layer `[train]`, then the world's own `[env.WORLD.train]`.
-pub(super) fn merged_train(stack: &[Layer], world: &str) -> Table {
+/// The training options of a world: per layer `[train]`, then the world's own `[env.WORLD.train]`, then those of
+/// its scene, `[env."WORLD/SCENE".train]`.
+pub(super) fn merged_train(stack: &[Layer], world: &WorldName) -> Table {
     let mut train = Table::new();
     for layer in stack {
-        let own = format!("env.{world}.train");
-        for section in ["train", &own] {
+        let (base, whole) = (format!("env.{}.train", world.base()), format!("env.{world}.train"));
+        let scene = (base != whole).then_some(&whole);
+        for section in ["train", &base].into_iter().chain(scene.map(String::as_str)) {
             if let Some(Value::Table(section)) = at(&layer.table, section) {
                 merge(&mut train, section);
             }
@@ -264,7 +266,7 @@ pub(super) fn merged_train(stack: &[Layer], world: &str) -> Table {
     train
 }
 
-/// The constants of a world.
+/// The constants that a layer, or several that are merged, gives a world or a world with a scene.
 pub(super) fn constants(merged: &Table, world: &str) -> Table {
     let mut table = match at(merged, &format!("env.{world}")) {
         Some(Value::Table(table)) => table.clone(),
@@ -272,4 +274,29 @@ pub(super) fn constants(merged: &Table, world: &str) -> Table {
     };
     table.remove("train");
     table
+}
+
+/// The constants of a world: its defaults, those that a scene of the program sets, `[env.WORLD]` of files and
+/// options, the scene's map, and `[env."WORLD/SCENE"]`.
+pub(super) fn world_constants(
+    catalogue: &Catalogue,
+    stack: &[Layer],
+    world: &WorldName,
+) -> Result<Table, ConfigError> {
+    let Some(name) = world.scene() else {
+        return Ok(constants(&merged(stack), world.base()));
+    };
+    let (default, given) = stack.split_first().expect("the default is the first layer");
+    let given = merged(given);
+    let own = constants(&given, world.as_str());
+    let mut table = constants(&default.table, world.base());
+    let (map, others) = match scenes::shipped(name) {
+        Some(scene) => scene.constants(catalogue.world(world)?)?,
+        None if own.is_empty() => return Err(scenes::unknown(name)),
+        None => (Table::new(), Table::new()),
+    };
+    for over in [others, constants(&given, world.base()), map, own] {
+        merge(&mut table, &over);
+    }
+    Ok(table)
 }

@@ -2,7 +2,7 @@
 //!
 //! ```toml
 //! # Range: [1, 1000]               an interval; ( and ) leave a bound out, inf is no bound
-//! # One of: "chosen", "executed"   these words; "cuda:N" allows any whole number N
+//! # One of: "chosen", "executed"   these words; "cuda:N" allows any whole number N, "lava-grid/SCENE" any scene
 //! ```
 //!
 //! Without such a line, the type of the default's value is the rule. Whether a range is one of whole
@@ -91,12 +91,15 @@ impl Rule {
             (Rule::Number(from, to), Value::Integer(_) | Value::Float(_)) => number(value)
                 .is_some_and(|value| value.is_finite() && (*from, *to).contains(&value)),
             (Rule::Word(words), Value::String(word)) => {
-                words.iter().any(|known| match known.strip_suffix(":N") {
-                    Some(name) => word
-                        .strip_prefix(name)
-                        .and_then(|rest| rest.strip_prefix(':'))
-                        .is_some_and(|number| number.parse::<usize>().is_ok()),
-                    None => known == word,
+                let rest = |name: &str, mark: char| word.strip_prefix(name)?.strip_prefix(mark);
+                words.iter().any(|known| {
+                    if let Some(name) = known.strip_suffix(":N") {
+                        rest(name, ':').is_some_and(|number| number.parse::<usize>().is_ok())
+                    } else if let Some(name) = known.strip_suffix("/SCENE") {
+                        rest(name, '/').is_some_and(|scene| !scene.is_empty())
+                    } else {
+                        known == word
+                    }
                 })
             }
             (Rule::Text, Value::String(_)) | (Rule::Flag, Value::Boolean(_)) => true,

@@ -14,6 +14,7 @@ pub(super) const INK: RGBColor = RGBColor(0x22, 0x22, 0x22);
 pub(super) const FAINT: RGBColor = RGBColor(0xD8, 0xD8, 0xD8);
 pub(super) const LAVA: RGBColor = RGBColor(0xD5, 0x5E, 0x00);
 pub(super) const GOAL: RGBColor = RGBColor(0x00, 0x9E, 0x73);
+pub(super) const LESSER_GOAL: RGBColor = RGBColor(0x7F, 0xCE, 0xB9);
 
 /// Size of the words in panels, in the canvas's units.
 pub(super) const TEXT: u32 = 26;

@@ -3,8 +3,8 @@
 
 use super::Panel;
 use super::canvas::{
-    Area, Drawn, FAINT, GOAL, INK, LAVA, Picture, TEXT, colour, figure, frame, heat, on, scale,
-    short, text,
+    Area, Drawn, FAINT, GOAL, INK, LAVA, LESSER_GOAL, Picture, TEXT, colour, figure, frame, heat,
+    on, scale, short, text,
 };
 use crate::experiment::figure_data::{
     BUDGET_CLASSES, CellData, Deviations, MOST_CELLS, PlaneData, ShiftMap, WorldData,
@@ -151,7 +151,7 @@ fn cells(canvas: &Area, grid: &Grid, origin: Origin) -> Drawn {
         if let Some(kind) = kind {
             canvas.draw(&Rectangle::new(corners, fill(*kind).filled()))?;
         }
-        if *kind == Some(AreaKind::Goal) {
+        if matches!(kind, Some(AreaKind::Goal | AreaKind::LesserGoal)) {
             let style = text(TEXT, on(GOAL), HPos::Center, VPos::Center);
             canvas.draw(&Text::new("G", at(origin, x + 0.5, y + 0.5), style))?;
         }
@@ -165,6 +165,7 @@ fn fill(kind: AreaKind) -> RGBColor {
     match kind {
         AreaKind::Lava => LAVA,
         AreaKind::Goal => GOAL,
+        AreaKind::LesserGoal => LESSER_GOAL,
         AreaKind::Wall => INK,
     }
 }
@@ -179,8 +180,10 @@ fn heat_map(
 ) -> Drawn {
     for (cell, value) in values.iter().enumerate() {
         // Episodes end in lava and goal: nothing happens there.
-        let ends =
-            matches!(grid.kinds.get(cell), Some(Some(AreaKind::Lava | AreaKind::Goal)) | None);
+        let ends = matches!(
+            grid.kinds.get(cell),
+            Some(Some(AreaKind::Lava | AreaKind::Goal | AreaKind::LesserGoal)) | None
+        );
         let Some(value) = value.filter(|_| !ends) else { continue };
         let (x, y) = grid.corner(cell);
         let shade = heat(value / greatest);

@@ -100,7 +100,7 @@ impl Figures {
         let scene = worlds.scene(env, &task.constants);
         let mut add = |name: &str, title: &str, figure: Option<(Picture, String)>| match figure {
             Some((picture, caption)) => self.drawn.push(Figure {
-                name: format!("{env}-{name}"),
+                name: format!("{}-{name}", env.replace('/', "+")),
                 title: format!("{env}: {title}"),
                 caption,
                 picture,

@@ -1,0 +1,194 @@
+//! Scenes: every one of the program keeps the promises of a world, in both worlds, and configurations place worlds on
+//! them.
+
+use cvar_game::experiment::config::{Config, Setting, Source, scenes};
+use cvar_game::experiment::names::RunId;
+use cvar_game::experiment::plan;
+use cvar_game::experiment::registry::standard;
+use lava_envs::conformance::check;
+use lava_envs::map::{Map, Tile};
+use lava_envs::random::{Purpose, stream};
+use lava_envs::{GridConfig, LavaGrid, LavaPoint, PointConfig, World};
+use rand::RngExt;
+use std::path::Path;
+
+fn on(scenes: &[&str], settings: &[&str]) -> Config {
+    let settings: Vec<Setting> =
+        settings.iter().map(|text| Setting::parse(text).unwrap()).collect();
+    let scenes: Vec<String> = scenes.iter().map(|&scene| scene.to_owned()).collect();
+    Config::resolve_on(standard().catalogue(), Source::Default, &settings, &scenes).unwrap()
+}
+
+fn refused(scenes: &[&str], settings: &[&str]) -> String {
+    let settings: Vec<Setting> =
+        settings.iter().map(|text| Setting::parse(text).unwrap()).collect();
+    let scenes: Vec<String> = scenes.iter().map(|&scene| scene.to_owned()).collect();
+    let found = Config::resolve_on(standard().catalogue(), Source::Default, &settings, &scenes);
+    found.expect_err("it should be refused").to_string()
+}
+
+fn grid(config: &Config, name: &str) -> GridConfig {
+    config.world(name).constants.of::<LavaGrid>().unwrap()
+}
+
+fn point(config: &Config, name: &str) -> PointConfig {
+    config.world(name).constants.of::<LavaPoint>().unwrap()
+}
+
+#[test]
+fn every_scene_keeps_the_promises_of_both_worlds() {
+    for (name, scene) in scenes::all() {
+        let config = on(&[name], &[]);
+        let cells = grid(&config, &format!("lava-grid/{name}"));
+        assert_eq!(Map::parse(&cells.map).unwrap(), scene.map);
+        check::<LavaGrid>(&cells);
+        check::<LavaPoint>(&point(&config, &format!("lava-point/{name}")));
+        assert!(scene.about.ends_with('.'), "{name} says {:?}", scene.about);
+    }
+}
+
+/// The areas of the plane are those of the map, cell by cell.
+#[test]
+fn the_plane_has_the_cells_of_the_map() {
+    let mut random = stream(1, Purpose::Outcomes, 0);
+    for _ in 0..300 {
+        let size = [random.random_range(2..9), random.random_range(2..9)];
+        let mut cells: Vec<char> = (0..size[0] * size[1])
+            .map(|_| ['.', '.', '.', 'L', 'G', 'g', '#'][random.random_range(0..7)])
+            .collect();
+        // One start, and one of each that a plane needs.
+        (cells[0], cells[1], cells[2]) = ('S', 'L', 'G');
+        let picture: Vec<String> = cells.chunks(size[0]).map(|row| row.iter().collect()).collect();
+        let map = Map::parse(&picture.join("\n")).unwrap();
+        let config: PointConfig = {
+            let mut table = toml::Table::try_from(PointConfig::default()).unwrap();
+            table.extend(LavaPoint::of_map(&map).unwrap());
+            table.try_into().unwrap()
+        };
+        let world = LavaPoint::new(&config, 1).unwrap();
+        let [width, height] = world.scene().size;
+        assert_eq!([width, height], size.map(|cells| cells as f64));
+        for cell in 0..map.cells() {
+            let (x, y) = map.coordinates(cell);
+            let centre = [x as f64 + 0.5, y as f64 + 0.5];
+            let inside = |min: [f64; 2], max: [f64; 2]| {
+                (0..2).all(|axis| (min[axis]..max[axis]).contains(&centre[axis]))
+            };
+            let kinds: Vec<lava_envs::AreaKind> = (world.scene().areas.iter())
+                .filter(|area| inside(area.min, area.max))
+                .map(|area| area.kind)
+                .collect();
+            use lava_envs::AreaKind::{Goal, Lava, LesserGoal, Wall};
+            let expected = match map.tile(cell) {
+                Tile::Free => vec![],
+                Tile::Lava => vec![Lava],
+                Tile::Goal => vec![Goal],
+                Tile::LesserGoal => vec![LesserGoal],
+                Tile::Wall => vec![Wall],
+            };
+            assert_eq!(kinds, expected, "cell ({x}, {y}) of\n{map}");
+        }
+    }
+}
+
+/// The default worlds are the first scene.
+#[test]
+fn the_paper_s_scene_is_the_default() {
+    let config = on(&["strait"], &[]);
+    assert_eq!(grid(&config, "lava-grid/strait"), GridConfig::default());
+    assert_eq!(point(&config, "lava-point/strait"), PointConfig::default());
+}
+
+/// A scene's other constants yield to a setting of the world; its map does not, and a setting of the world on the scene
+/// wins over both.
+#[test]
+fn settings_of_a_world_hold_on_its_scenes() {
+    let own_map = r#"env.lava-grid.map="S.G""#;
+    let config = on(&["island"], &["env.slip=0.2", own_map, "env.lava-grid/island.horizon=77"]);
+    let island = grid(&config, "lava-grid/island");
+    assert_eq!((island.slip, island.horizon), (0.2, 77));
+    assert_eq!(Map::parse(&island.map).unwrap(), scenes::shipped("island").unwrap().map);
+    assert_eq!(grid(&config, "lava-grid").map, "S.G");
+    let training = on(&["island"], &["env.lava-grid.train.steps=123456"]);
+    assert_eq!(training.world("lava-grid/island").train.steps, 123_456);
+    let training =
+        on(&["island"], &["train.steps=7777777", "env.lava-grid/island.train.steps=654321"]);
+    assert_eq!(training.world("lava-grid/island").train.steps, 654_321);
+    assert_eq!(training.world("lava-point/island").train.steps, 7_777_777);
+}
+
+/// The resolved configuration of a sweep on scenes resolves to itself, without the file of a scene.
+#[test]
+fn a_resolved_configuration_needs_no_file() {
+    let folder = tempfile::tempdir().unwrap();
+    let own = folder.path().join("my-own.toml");
+    let text = "about = \"Two lanes.\"\nhorizon = 25\nmap = \"\"\"\nS.LL.G\n......\n\"\"\"\n[lava-point]\nnoise = 1.0\n";
+    std::fs::write(&own, text).unwrap();
+    let config = on(&[own.to_str().unwrap(), "detour"], &["experiment.seeds=[1]"]);
+    std::fs::remove_file(&own).unwrap();
+    let (cells, plane) = (grid(&config, "lava-grid/my-own"), point(&config, "lava-point/my-own"));
+    assert_eq!((cells.horizon, plane.horizon, plane.noise), (25, 25, 1.0));
+    assert_eq!((plane.arena, plane.start), ([6.0, 2.0], [0.5, 0.5]));
+
+    let resolved = folder.path().join("resolved.toml");
+    std::fs::write(&resolved, config.to_toml()).unwrap();
+    let source = Source::File(&resolved);
+    let again = Config::resolve(standard().catalogue(), source, &[]).unwrap();
+    assert_eq!(again.to_toml(), config.to_toml());
+    assert_eq!(plan::runs(&again), plan::runs(&config));
+    for id in plan::runs(&config) {
+        assert_eq!(id.to_string().parse::<RunId>().unwrap(), id);
+        assert!(id.folder(Path::new("out")).starts_with(format!("out/{}", id.world.as_file())));
+        let run = config.run(&id);
+        assert_eq!(again.run(&id), run);
+        let path = folder.path().join("config.toml");
+        let catalogue = standard().catalogue();
+        let parsed =
+            cvar_game::experiment::config::RunConfig::parse(&path, &run.to_toml(), catalogue);
+        assert_eq!(parsed.unwrap(), run);
+    }
+}
+
+#[test]
+fn wrong_scenes_are_refused_in_a_sentence() {
+    let folder = tempfile::tempdir().unwrap();
+    let file = |name: &str, text: &str| {
+        let path = folder.path().join(name);
+        std::fs::write(&path, text).unwrap();
+        path.to_str().unwrap().to_owned()
+    };
+    let map = "map = \"\"\"\nS.L.G\n.....\n\"\"\"\n";
+    let wrong = [
+        (refused(&["nowhere"], &[]), "there is no scene \"nowhere\"; the scenes are strait, "),
+        (refused(&["nowhere.toml"], &[]), "cannot read nowhere.toml"),
+        (refused(&[&file("a.toml", "about = \"A.\"")], &[]), "a scene needs the key map"),
+        (refused(&[&file("b.toml", map)], &[]), "a scene needs the key about"),
+        (
+            refused(&[&file("c.toml", "about = \"C.\"\nmap = \"S.X\"")], &[]),
+            "c.toml: map, row 1, column 3: 'X' is no cell",
+        ),
+        (
+            refused(
+                &[&file("d.toml", &format!("about = \"D.\"\n{map}[lava-grid]\nnoise = 1"))],
+                &[],
+            ),
+            "lava-grid has no constant noise",
+        ),
+        (
+            refused(&[&file("e.toml", "about = \"E.\"\nmap = \"S.G\"")], &[]),
+            "lava-point cannot be played here: the map has no lava `L`",
+        ),
+        (
+            refused(&[&file("f.toml", &format!("about = \"F.\"\nhorizont = 3\n{map}"))], &[]),
+            "no world has a constant horizont",
+        ),
+        (
+            refused(&[], &["experiment.envs=[\"lava-grid/x y\"]"]),
+            "\"lava-grid/x y\" cannot be a name",
+        ),
+    ];
+    for (message, part) in wrong {
+        assert!(message.contains(part), "{message:?} does not contain {part:?}");
+        assert!(!message.contains('\n'), "{message:?}");
+    }
+}
