@@ -142,9 +142,9 @@ fn wrong_usage_is_refused_with_the_reason() {
         (vec!["slurm"], "--config <FILE>"),
         (
             vec!["train", "--env", "lava-lake", "--eta", "1", "--seed", "1"],
-            "\"lava-grid\" or \"lava-point\"",
+            "\"lava-grid\", \"lava-point\"",
         ),
-        (vec!["config", "--env", "pit"], "\"lava-grid\" or \"lava-point\""),
+        (vec!["config", "--env", "pit"], "\"lava-grid\", \"lava-point\""),
         (
             vec!["bench", "--config", "x", "--device", "tpu"],
             "is not \"cpu\", \"cuda\" or \"cuda:N\"",
@@ -205,7 +205,7 @@ fn a_world_whose_goal_is_out_of_reach_is_refused() {
         ),
         ("env.lava-point.lava.max=[10, 2]", ["env.lava-point.goal", "does not touch the lava"]),
         ("env.lava-point.lava.max=[8, 6.9]", ["env.lava-point.goal", "does not touch the lava"]),
-        ("env.lava-point.start=[3, 1]", ["env.lava-point.start", "neither the lava"]),
+        ("env.lava-point.start=[3, 1]", ["env.lava-point.start", "neither lava"]),
     ] {
         let message = refusal(&["config", "--set", &set.replace("\\n", "\n")]);
         for part in parts {

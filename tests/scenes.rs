@@ -192,3 +192,63 @@ fn wrong_scenes_are_refused_in_a_sentence() {
         assert!(!message.contains('\n'), "{message:?}");
     }
 }
+
+/// The best CVaR of a scene on lava-grid, and what the risk-neutral policy and Chow's programme say.
+fn solved(name: &str, eta: f64) -> serde_json::Value {
+    let config = on(&[name], &[]);
+    let constants = &config.world(format!("lava-grid/{name}")).constants;
+    let options = Default::default();
+    let answer = standard().world(constants).unwrap().solve(constants, 1.0, eta, &options, &());
+    serde_json::from_str(&answer.unwrap().json()).unwrap()
+}
+
+/// The table of docs/scenes.md.
+#[test]
+fn the_documented_optima_are_those_of_the_solver() {
+    let text = std::fs::read_to_string("docs/scenes.md").unwrap();
+    let rows: Vec<Vec<&str>> = (text.lines())
+        .filter(|line| line.starts_with("| `") && line.matches('|').count() == 7)
+        .map(|line| line.split('|').map(|cell| cell.trim().trim_matches('`')).collect())
+        .collect();
+    assert_eq!(rows.len(), scenes::all().count());
+    for row in rows {
+        let [neutral, twentyfifth, hundredth] = [1.0, 25.0, 100.0].map(|eta| solved(row[1], eta));
+        let found = [
+            &neutral["optimal_cvar"],
+            &twentyfifth["optimal_cvar"],
+            &twentyfifth["risk_neutral_cvar"],
+            &hundredth["optimal_cvar"],
+            &hundredth["risk_neutral_cvar"],
+        ];
+        let found = found.map(|number| format!("{:.4}", number.as_f64().unwrap()));
+        assert_eq!(found, row[2..7], "{}", row[1]);
+    }
+}
+
+#[test]
+fn chow_s_programme_is_far_off_on_its_scene() {
+    let off = |name, eta| {
+        let answer = solved(name, eta);
+        answer["chow_value"].as_f64().unwrap() - answer["optimal_cvar"].as_f64().unwrap()
+    };
+    assert!(off("chow-gap", 4.0) > 0.05 && off("strait", 4.0) < 0.002);
+}
+
+/// The corridor up to a budget, the long way from there on.
+#[test]
+fn the_optimum_of_the_detour_changes_its_way_once() {
+    let corridor = |eta: f64| {
+        let path = solved("detour", eta)["path"].clone();
+        path.as_array().unwrap().iter().all(|step| step["y"] == 5)
+    };
+    let (mut low, mut high) = (1.0_f64, 25.0_f64);
+    assert!(corridor(low) && !corridor(high));
+    while high - low > 0.02 {
+        let middle = low.midpoint(high);
+        *if corridor(middle) { &mut low } else { &mut high } = middle;
+    }
+    assert!((low..=high).contains(&SWITCH), "between {low} and {high}");
+}
+
+/// The budget at which it does, as the scene says.
+const SWITCH: f64 = 2.069;

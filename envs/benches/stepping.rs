@@ -3,9 +3,11 @@
 //! Random pushes keep discs at the walls more than a policy does. `lava-point/open` is the same batch
 //! with the walls out of reach, so that Rapier is not called: the difference to `lava-point/batch` is
 //! the time of Rapier's pipeline. `lava-point/rapier-alone` computes every substep of every disc in
-//! Rapier, free flight included: the difference is what the separate free flight saves.
+//! Rapier, free flight included: the difference is what the separate free flight saves. `scenes` are those of the
+//! program, in the plane.
 
 use criterion::{Criterion, Throughput, criterion_group, criterion_main};
+use lava_envs::map::Map;
 use lava_envs::random::{ChaCha8Rng, Purpose, stream};
 use lava_envs::{
     Discrete, Force, GridConfig, LavaGrid, LavaPoint, Law, Move, PointConfig, Step, World,
@@ -87,8 +89,40 @@ fn stepping(criterion: &mut Criterion) {
     group.bench_function("lava-point/rapier-alone", |bencher| {
         bencher.iter(|| rapier.step(push));
     });
+
+    // Pillars all over the arena, along which discs slide.
+    let pillar = |x: u32, y: u32| [f64::from(x), f64::from(y)].map(|c| 1.3 + 1.2 * c);
+    let places = (0..7).flat_map(|x| (0..4).map(move |y| pillar(x, y)));
+    let walls = places.map(|[x, y]| [x, y + 0.9, x + 0.4, y + 1.3]).collect();
+    let pillars = PointConfig { walls, ..PointConfig::default() };
+    let mut pillars = Driver::new(LavaPoint::new(&pillars, EPISODES).unwrap());
+    group.bench_function("lava-point/pillars", |bencher| {
+        bencher.iter(|| pillars.step(push));
+    });
     group.finish();
 }
 
-criterion_group!(benches, stepping);
+/// lava-point on every scene of `configs/scenes`.
+fn scenes(criterion: &mut Criterion) {
+    let folder = concat!(env!("CARGO_MANIFEST_DIR"), "/../configs/scenes");
+    let mut files: Vec<_> =
+        std::fs::read_dir(folder).unwrap().map(|entry| entry.unwrap().path()).collect();
+    files.sort();
+    let mut group = criterion.benchmark_group("scenes");
+    group.throughput(Throughput::Elements(EPISODES as u64));
+    for file in files {
+        let scene: toml::Table = std::fs::read_to_string(&file).unwrap().parse().unwrap();
+        let map = Map::parse(scene["map"].as_str().unwrap()).unwrap();
+        let mut constants = toml::Table::try_from(PointConfig::default()).unwrap();
+        constants.extend(LavaPoint::of_map(&map).unwrap());
+        let config: PointConfig = constants.try_into().unwrap();
+        let mut point = Driver::new(LavaPoint::new(&config, EPISODES).unwrap());
+        group.bench_function(file.file_stem().unwrap().to_str().unwrap(), |bencher| {
+            bencher.iter(|| point.step(push));
+        });
+    }
+    group.finish();
+}
+
+criterion_group!(benches, stepping, scenes);
 criterion_main!(benches);

@@ -159,9 +159,9 @@ impl World {
         let of = valid(self.world.describe(&self.constants))?;
         let [states, outcomes] = of.finite.map_or([None; 2], |of| of.map(Some));
         let scene = &of.scene;
-        let area = |area: &lava_envs::Area| serde_json::json!({"kind": format!("{:?}", area.kind).to_lowercase(), "min": area.min, "max": area.max});
+        let area = |area: &lava_envs::Area| serde_json::json!({"kind": area.kind, "min": area.min, "max": area.max});
         Ok(serde_json::json!({
-            "name": self.world.name(),
+            "name": self.constants.world.as_str(),
             "horizon": of.horizon,
             "actions": of.actions,
             "states": states,
@@ -770,7 +770,7 @@ fn write_run(
         None => (method, None),
     };
     let run = RunId {
-        world: world.world.name().parse().map_err(|error| text(&error))?,
+        world: world.constants.world.clone(),
         method: method.parse().map_err(|error| text(&error))?,
         variant,
         eta: budget(eta)?,
@@ -790,7 +790,7 @@ fn write_run(
     let folder = run.folder(&out);
     let mut task = toml::Table::new();
     task.insert("gamma".to_owned(), discount(gamma)?.into());
-    let of_world = [(world.world.name().to_owned(), world.constants.table.clone().into())];
+    let of_world = [(world.constants.world.to_string(), world.constants.table.clone().into())];
     task.insert("env".to_owned(), toml::Value::Table(of_world.into_iter().collect()));
     let write = || -> std::io::Result<()> {
         std::fs::create_dir_all(&folder)?;
@@ -823,6 +823,14 @@ fn worlds_of() -> Vec<&'static str> {
     worlds::WORLDS.iter().map(|world| world.name()).collect()
 }
 
+/// The scenes of the program: name, what is special about it, and its map as text.
+#[pyfunction]
+fn scenes_of() -> Vec<(&'static str, String, String)> {
+    cvar_game::experiment::config::scenes::all()
+        .map(|(name, scene)| (name, scene.about, scene.map.to_string()))
+        .collect()
+}
+
 #[pymodule]
 mod _core {
     #[pymodule_export]
@@ -830,5 +838,7 @@ mod _core {
     #[pymodule_export]
     use super::mdp::{Mdp, MdpWorstCase, Optimum};
     #[pymodule_export]
-    use super::{Games, Judged, Opponent, Run, World, program, read_results, worlds_of, write_run};
+    use super::{
+        Games, Judged, Opponent, Run, World, program, read_results, scenes_of, worlds_of, write_run,
+    };
 }

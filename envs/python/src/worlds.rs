@@ -30,13 +30,14 @@ use std::path::Path;
 pub static WORLDS: [&dyn AnyWorld; 2] =
     [&Of::<LavaGrid>(PhantomData), &Of::<LavaPoint>(PhantomData)];
 
-/// The world of a name.
+/// The world of a name, on whatever scene.
 ///
 /// # Errors
 /// If there is none; the error names those that there are.
 pub fn named(name: &str) -> Result<&'static dyn AnyWorld, String> {
     let names = || WORLDS.map(|world| world.name()).join(" and ");
-    let found = WORLDS.iter().find(|world| world.name() == name).copied();
+    let base = name.split_once('/').map_or(name, |(base, _)| base);
+    let found = WORLDS.iter().find(|world| world.name() == base).copied();
     found.ok_or_else(|| format!("there is no world {name:?}; there are {}", names()))
 }
 
@@ -49,7 +50,7 @@ pub fn constants(
     changes: &serde_json::Map<String, serde_json::Value>,
 ) -> Result<WorldConstants, String> {
     named(world)?;
-    let mut settings = Vec::new();
+    let mut settings = vec![Setting::option("the world", "experiment.envs", vec![world])];
     for (key, value) in changes {
         let value = toml::Value::try_from(value).map_err(|error| format!("{key}: {error}"))?;
         settings.push(Setting::option(key, &format!("env.{world}.{key}"), value));

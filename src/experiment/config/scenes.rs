@@ -44,6 +44,7 @@ const SHIPPED: &[(&str, &str)] = &[
     shipped!("two-goals"),
     shipped!("cliff-walk"),
     shipped!("island"),
+    shipped!("chow-gap"),
 ];
 
 /// A map and constants.

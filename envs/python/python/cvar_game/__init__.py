@@ -13,7 +13,7 @@ from cvar_game.envs import LavaEnv, LavaVectorEnv
 from cvar_game.mdp import BudgetedAntagonist, FiniteMDP
 from cvar_game.policies import tabulate
 from cvar_game.results import Run, load, record, results
-from cvar_game.worlds import World, WorstCase, worlds
+from cvar_game.worlds import World, WorstCase, scenes, worlds
 from cvar_game.yardsticks import (
     Evaluation,
     Exact,
@@ -45,6 +45,7 @@ __all__ = [
     "record",
     "regret",
     "results",
+    "scenes",
     "tabulate",
     "worlds",
     "worst_case",

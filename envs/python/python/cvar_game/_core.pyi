@@ -23,6 +23,7 @@ __all__ = [
     "World",
     "program",
     "read_results",
+    "scenes_of",
     "worlds_of",
     "write_run",
 ]
@@ -307,6 +308,7 @@ class MdpWorstCase:
         """The likelihood ratios by time, state and outcome, shape ``(T, S, K)``."""
 
 def program(command: Sequence[str]) -> int: ...
+def scenes_of() -> list[tuple[str, str, str]]: ...
 def worlds_of() -> list[str]: ...
 def write_run(
     out: _Folder,

@@ -11,13 +11,13 @@ import numpy.typing as npt
 if TYPE_CHECKING:
     from cvar_game.worlds import World
 
-MARKS = {"lava": "L", "goal": "G", "wall": "#"}
+MARKS = {"lava": "L", "goal": "G", "lesser-goal": "g", "wall": "#"}
 # Characters per metre, where the scene is not of cells.
 PER_METRE = 2.0
 
 
 def ansi(world: World, trail: Sequence[npt.NDArray[Any]]) -> str:
-    """The map: ``S`` start, ``G`` goal, ``L`` lava, ``#`` wall, ``o`` the way, ``@`` the protagonist."""
+    """The map: ``S`` start, ``G`` goal, ``g`` lesser goal, ``L`` lava, ``#`` wall, ``o`` the way, ``@`` the protagonist."""
     scene = world.scene
     scale = 1.0 if scene["cells"] else PER_METRE
     width, height = (int(np.ceil(side * scale)) for side in scene["size"])

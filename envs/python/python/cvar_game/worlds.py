@@ -24,11 +24,19 @@ def worlds() -> list[str]:
     return list(_core.worlds_of())
 
 
+def scenes() -> dict[str, str]:
+    """The maps of the scenes, by name.
+
+    A world is played on one by the name ``WORLD/SCENE``, such as ``"lava-point/detour"``.
+    """
+    return {name: picture for name, _, picture in _core.scenes_of()}
+
+
 class World:
     """A world with its constants.
 
     Args:
-        name: ``"lava-grid"`` or ``"lava-point"``.
+        name: ``"lava-grid"`` or ``"lava-point"``, or either on a scene, such as ``"lava-grid/detour"``.
         constants: Those that differ from the defaults, such as ``slip=0.1`` or ``noise=1.5``;
             ``cvar-game envs`` prints all with their meaning and range.
 
