@@ -157,7 +157,7 @@ fn bad_values_are_refused_with_key_value_and_range() {
         ("experiment.etas=[1, 1.0]", ["experiment.etas", "without duplicates"]),
         ("experiment.seeds=[1, 2, 1]", ["[1, 2, 1]", "without duplicates (1 is there twice)"]),
         ("experiment.seeds=[-1]", ["[-1]", "a whole number of at least 0"]),
-        ("experiment.envs=[\"lava-lake\"]", ["lava-lake", "\"lava-grid\" or \"lava-point\""]),
+        ("experiment.envs=[\"lava-lake\"]", ["lava-lake", "\"lava-grid\", \"lava-point\""]),
         ("train.steps=0", ["train.steps = 0", "a whole number of at least 1"]),
         ("train.steps=1e6", ["train.steps = 1000000.0", "a whole number of at least 1"]),
         ("train.steps=many", ["train.steps = \"many\"", "a whole number of at least 1"]),
@@ -427,14 +427,19 @@ fn every_option_has_a_rule_that_its_default_follows() {
         "env.lava-point.goal.min",
         "env.lava-point.lava.max",
         "env.lava-point.lava.min",
+        "env.lava-point.lesser_goals",
+        "env.lava-point.more_goals",
+        "env.lava-point.more_lava",
         "env.lava-point.radius",
         "env.lava-point.start",
+        "env.lava-point.walls",
         "experiment.shifts",
         "experiment.variant",
     ];
     assert_eq!(unstated, checked_elsewhere);
     assert_eq!(stated["train.family.count"], format!("Range: [1, {MOST}]"));
-    assert_eq!(stated["experiment.envs"], "One of: \"lava-grid\", \"lava-point\"");
+    let worlds = "One of: \"lava-grid\", \"lava-point\", \"lava-grid/SCENE\", \"lava-point/SCENE\"";
+    assert_eq!(stated["experiment.envs"], worlds);
     assert!(!standard().catalogue().annotated_default().contains("of the program\n"));
 }
 

@@ -214,3 +214,37 @@ fn what_is_out_of_range_is_refused() {
     assert!(matches!(refused(&slippery, 1.0), Some(YardstickError::Exact(ExactError::Config(_)))));
     assert!(refused(&GridConfig::default(), 1.5).is_some());
 }
+
+/// Every gain is the difference of two exact values, of the policy and of the table with that one change.
+#[test]
+fn a_single_change_is_worth_what_the_changed_policy_attains() {
+    let (yardstick, grid) = (yardstick(), grid());
+    let exact = exact(&*yardstick);
+    let (timed, _) = careless(&grid);
+    let stationary =
+        TablePolicy::from_fn([70, 4], None, |_, cell| timed.probabilities(0, cell).to_vec());
+    for policy in [&timed, &stationary] {
+        let found = exact.changes(ETA, policy).unwrap();
+        let cvar = exact.laws(policy).unwrap().greedy.cvar(1.0 / ETA);
+        assert!((found.cvar - cvar).abs() < 1e-12);
+        assert!(found.changes.windows(2).all(|pair| pair[0].gain >= pair[1].gain));
+        let first = &found.changes[0];
+        assert!(first.gain > 0.001, "{found}");
+        for change in found.changes.iter().step_by(17) {
+            let cell = change.y * 10 + change.x;
+            let action = ["up", "down", "right", "left"];
+            let action = action.iter().position(|name| *name == change.action).unwrap();
+            let changed = |time: u32, of: usize| {
+                let mut row = [0.0; 4];
+                row[if of == cell { action } else { policy.greedy_action(time, of) }] = 1.0;
+                row.to_vec()
+            };
+            let times = policy.sees_time().then_some(40);
+            let changed = TablePolicy::from_fn([70, 4], times, changed);
+            let truth = exact.laws(&changed).unwrap().greedy.cvar(1.0 / ETA) - cvar;
+            assert!((change.gain - truth).abs() < 1e-12, "{change:?}: {truth}");
+        }
+    }
+    // Nothing is better than what is optimal.
+    assert!(exact.changes(1.0, &timed).unwrap().changes.iter().all(|of| of.gain < 1e-12));
+}

@@ -143,7 +143,7 @@ fn refusals_say_what_where_and_what_to_do() {
     assert_eq!(
         map("S.\n.x"),
         "map, row 2, column 2: 'x' is no cell; \
-         use S (start), G (goal), L (lava), . (free) or # (wall)"
+         use S (start), G (goal), g (lesser goal), L (lava), . (free) or # (wall)"
     );
     assert_eq!(
         map("  S.G\n  ..S"),

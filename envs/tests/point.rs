@@ -403,7 +403,7 @@ fn refusals_name_field_value_and_range() {
         ),
         (PointConfig { start: [0.05, 0.5], ..base() }, "start = [0.05, 0.5] is not allowed"),
         (PointConfig { start: [1.95, 1.0], ..base() }, "touch neither lava"),
-        (PointConfig { start: [9.5, 0.5], ..base() }, "the goal region"),
+        (PointConfig { start: [9.5, 0.5], ..base() }, "a goal region"),
         (
             PointConfig { radius: 3.5, ..base() },
             "radius = 3.5 is not allowed: above 0 and below 3.5",

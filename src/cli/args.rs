@@ -250,14 +250,19 @@ Examples:
   cvar-game exact --env lava-grid --eta 25
   cvar-game exact --env lava-grid --eta 100 --set env.slip=0.1 --json
   cvar-game exact --env lava-point --eta 25
-  cvar-game exact --env lava-point --eta 25 --cell 0.2 --velocity 0.75")]
+  cvar-game exact --env lava-point --eta 25 --cell 0.2 --velocity 0.75
+  cvar-game exact --policy results/quick/lava-grid/game/eta-25/seed-1")]
 pub struct ExactArgs {
     /// World, such as lava-grid or lava-point.
-    #[arg(long)]
-    pub env: WorldName,
+    #[arg(long, required_unless_present = "policy")]
+    pub env: Option<WorldName>,
     /// Budget, at least 1; the risk level is alpha = 1/eta.
-    #[arg(long, allow_negative_numbers = true)]
-    pub eta: f64,
+    #[arg(long, allow_negative_numbers = true, required_unless_present = "policy")]
+    pub eta: Option<f64>,
+    /// A finished run's folder, in a finite world: what every single change of its policy is worth, in one cell
+    /// another action. At the run's budget, or at --eta.
+    #[arg(long, value_name = "RUN", conflicts_with_all = ["env", "config", "cell", "velocity", "anew", "settings", "scenes"])]
+    pub policy: Option<PathBuf>,
     /// Configuration file.
     #[arg(long, value_name = "FILE")]
     pub config: Option<PathBuf>,

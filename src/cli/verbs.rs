@@ -311,7 +311,14 @@ fn budget(eta: f64) -> Result<Setting> {
 }
 
 fn exact(registry: &Registry, args: &ExactArgs) -> Result<ExitCode> {
-    let options = vec![select(&args.env), budget(args.eta)?];
+    if let Some(folder) = &args.policy {
+        let run = read_run(registry, folder)?;
+        let eta = args.eta.map(|eta| Eta::new(eta).context("--eta")).transpose()?;
+        let found = registry.world(&run.env)?.changes(&run, folder, eta.map(Eta::get))?;
+        return print(&if args.json { found.json() } else { found.to_string() });
+    }
+    let mut options: Vec<Setting> = args.env.iter().map(select).collect();
+    options.extend(args.eta.map(budget).transpose()?);
     let source = Source::of(args.config.as_deref());
     let config = args.overrides.resolve(registry.catalogue(), source, options)?;
     let (gamma, eta) = (config.base.gamma, config.experiment.etas[0].get());

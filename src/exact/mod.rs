@@ -13,6 +13,7 @@
 //! | what is a policy of any method to an exact solver | [`table`] |
 //! | all of it in any finite world | [`finite`] |
 //! | what can be attained certifiably on the point mass, where nothing is exact | [`oracle`] |
+//! | what single changes of a policy are worth | [`changes`] |
 //! | all of it for any world, by one interface | [`yardstick`] |
 //! | how far is a computation that takes minutes | [`mod@watch`] |
 //!
@@ -21,6 +22,7 @@
 
 pub mod antagonist;
 pub mod certificate;
+pub mod changes;
 pub mod chow;
 pub mod finite;
 pub mod law;

@@ -123,11 +123,16 @@ pub struct Lattice {
 
 impl Lattice {
     /// The lattice of a world. Its velocities are a third of the noise apart, but at least a fifth of the
-    /// acceleration; its positions as many as the default world's at 0.1 m, where nodes lie on the borders of
+    /// acceleration; its positions about as many as the default world's at 0.1 m, where nodes lie on the borders of
     /// its lava and goal, or as many as fit into memory.
     pub fn of(config: &PointConfig) -> Lattice {
         let [width, height] = config.arena;
-        let fine = (width * height / 7000.0).sqrt().min(widest(config));
+        let mut fine = (width * height / 7000.0).sqrt();
+        // Where it is about the radius, it is the radius: borders at whole metres then have nodes.
+        if (0.7..1.4).contains(&(fine / config.radius)) {
+            fine = config.radius;
+        }
+        let fine = fine.min(widest(config));
         let velocity = (config.noise / 3.0).max(config.acceleration / 5.0);
         let mut lattice =
             Lattice { cell: rounded(fine), velocity: if velocity > 0.0 { velocity } else { 1.0 } };

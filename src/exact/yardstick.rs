@@ -28,6 +28,7 @@
 
 use super::ExactError;
 use super::antagonist::WorstCase;
+use super::changes::{Changes, changes};
 use super::finite::{ExactWorld, Exposure};
 use super::law::evaluate;
 use super::mdp::FiniteMdp;
@@ -313,6 +314,12 @@ pub trait ExactYardstick: Send + Sync {
     /// If the budget is out of range or the policy does not fit the world.
     fn exposure(&self, eta: f64, policy: &TablePolicy) -> Result<Exposure, ExactError>;
 
+    /// What single changes of the greedy policy are worth at a budget.
+    ///
+    /// # Errors
+    /// If the budget is out of range or the policy does not fit the world.
+    fn changes(&self, eta: f64, policy: &TablePolicy) -> Result<Changes, ExactError>;
+
     /// Expected visits of each state by the greedy policy, ends included, when every action is carried
     /// out as it was chosen; `None` where the world has actions that no outcome carries out.
     ///
@@ -467,6 +474,10 @@ impl<W: World> ExactYardstick for Exact<W> {
         let greedy = policy.on(&self.world)?.greedy(self.mdp());
         let worst = self.world.worst_case(&greedy, eta)?;
         Ok(self.world.exposure(&greedy, &worst))
+    }
+
+    fn changes(&self, eta: f64, policy: &TablePolicy) -> Result<Changes, ExactError> {
+        changes(&self.world, eta, self.optimum(eta)?.cvar, policy)
     }
 
     fn occupancy_as_intended(&self, policy: &TablePolicy) -> Result<Option<Vec<f64>>, ExactError> {

@@ -465,7 +465,7 @@ impl Settings {
         let with_scenes = selected.iter().filter(|world| world.scene().is_some()).cloned();
         for world in all.into_iter().chain(with_scenes) {
             let train: TrainOptions = typed("train", layers::merged_train(stack, &world))?;
-            let table = layers::world_constants(catalogue, stack, &world)?;
+            let table = scenes::constants(catalogue, stack, &world)?;
             let constants = WorldConstants { world: world.clone(), table }.checked(catalogue)?;
             worlds.insert(world, WorldSettings { constants, train });
         }

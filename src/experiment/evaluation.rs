@@ -13,6 +13,7 @@ use super::artefacts::{Audit, Certificate, Chance, Findings, Play};
 use super::config::RunConfig;
 use super::failure::RunError;
 use super::frozen::FrozenOpponent;
+use crate::exact::changes::Changes;
 use crate::exact::table::TablePolicy;
 use crate::exact::yardstick::{self, Evidence, Ratios, Solvable, Yardstick};
 use crate::game::returns::{ReturnLaw, ReturnSoFar};
@@ -114,6 +115,19 @@ impl<W: Arena + Solvable> Contestants<'_, W> {
             return Ok(exact.laws(&policy)?.greedy);
         }
         Ok(self.play(Mode::Greedy, Chance::Nominal, &mut ())?.law())
+    }
+
+    /// What single changes of the greedy protagonist are worth, at the run's budget or another.
+    ///
+    /// # Errors
+    /// If the world is not finite or refuses its constants.
+    pub fn changes(&self, eta: f64) -> Result<Changes, RunError> {
+        let yardstick = self.yardstick()?;
+        let exact = yardstick.as_ref().and_then(|yardstick| yardstick.exact());
+        match (exact, self.table()?) {
+            (Some(exact), Some(policy)) => Ok(exact.changes(eta, &policy)?),
+            _ => Err(RunError::NotFinite(W::NAME)),
+        }
     }
 
     /// Plays episodes of the run's evaluation, shown to `watcher`.

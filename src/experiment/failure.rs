@@ -35,6 +35,11 @@ pub enum RunError {
     /// The world has no yardstick.
     #[error("nothing is known about the optimum of {0}: it is not finite and has no oracle")]
     NoYardstick(String),
+    /// The world's states are not finitely many.
+    #[error(
+        "single changes of a policy are known in finite worlds only, such as lava-grid, not in {0}"
+    )]
+    NotFinite(&'static str),
     /// The weights are not those of the run.
     #[error("final.safetensors does not fit the run: {0}")]
     Weights(#[from] WeightsError),

@@ -194,6 +194,17 @@ pub trait Entry: Any + Send + Sync {
         request: &Request<'_>,
     ) -> Result<ReturnLaw, RunError>;
 
+    /// What single changes of the finished run's greedy protagonist are worth, at the run's budget or another.
+    ///
+    /// # Errors
+    /// As [`Entry::evaluate`], and if the world is not finite.
+    fn changes(
+        &self,
+        run: &RunConfig,
+        folder: &Path,
+        eta: Option<f64>,
+    ) -> Result<Box<dyn Answer>, RunError>;
+
     /// Writes every step of episodes of the finished run in `folder`.
     ///
     /// # Errors
@@ -381,6 +392,18 @@ impl<W: Arena + Solvable> Entry for WorldEntry<W> {
         let players = self.load(&run, folder)?;
         let (run, constants, players) = (&run, &constants, &*players);
         Contestants { run, constants, players, progress: request.progress }.greedy_law()
+    }
+
+    fn changes(
+        &self,
+        run: &RunConfig,
+        folder: &Path,
+        eta: Option<f64>,
+    ) -> Result<Box<dyn Answer>, RunError> {
+        let constants = &constants::<W>(&run.env)?;
+        let players = &*self.load(run, folder)?;
+        let contestants = Contestants { run, constants, players, progress: &|| () };
+        Ok(Box::new(contestants.changes(eta.unwrap_or(run.eta.get()))?))
     }
 
     fn rollout(

@@ -1,4 +1,5 @@
-//! Chores of the workspace: `cargo xtask torch`, `python`, `wheel`, `speed`, `scaling`, `oracle`.
+//! Chores of the workspace: `cargo xtask torch`, `python`, `wheel`, `speed`, `scaling`, `oracle`,
+//! `certificates`.
 //!
 //! Nothing here is needed to build, test or use the program. `torch` provides libtorch, a C++ library of
 //! 480 MB that cargo cannot fetch, and runs a cargo command with the feature `torch`: it fetches the
@@ -53,6 +54,9 @@ enum Verb {
     /// Compute the oracle of lava-point over noise and control steps, in about 40 minutes; the table goes to
     /// results/oracle
     Oracle,
+    /// Compute the certificates of lava-point that come with the program and are not there yet, for every scene; they go to
+    /// configs/oracle.json
+    Certificates,
     /// Measure the speed of training and its parts; the table goes to target/speed.md
     Speed {
         /// Passed on to the benchmarks, such as a filter of their names: `rollout`
@@ -87,6 +91,7 @@ fn run(verb: Verb) -> Result<ExitCode> {
         Verb::Wheel => python::wheel(&repository, &speed::target(&repository)),
         Verb::Scaling => with_program(&repository, scaling::measure),
         Verb::Oracle => with_program(&repository, oracle::measure),
+        Verb::Certificates => with_program(&repository, oracle::certify),
         Verb::Speed { passed_on } => {
             let target = speed::target(&repository);
             let start = SystemTime::now();

@@ -1,4 +1,5 @@
-//! The oracle of lava-point over noise and control steps, as a table of what it certifies and how it checks.
+//! The oracle of lava-point: over noise and control steps, as a table of what it certifies and how it checks, and its
+//! certificates on every scene, which come with the program.
 
 use std::fmt::Write as _;
 use std::fs;
@@ -107,6 +108,62 @@ pub fn measure(repository: &Path, target: &Path) -> Result<()> {
         fs::write(&path, text).with_context(|| format!("{} cannot be written", path.display()))?;
     }
     Ok(())
+}
+
+/// Budgets of the certificates on scenes.
+const ETAS: [u32; 3] = [1, 25, 100];
+
+/// Adds the certificates of lava-point on every scene to `configs/oracle.json`. Each is kept as soon as it is known.
+pub fn certify(repository: &Path, target: &Path) -> Result<()> {
+    let program = target.join("release").join("cvar-game");
+    let cache = target.join("certificates");
+    let ask = |arguments: &[&str]| -> Result<Value> {
+        let output = Command::new(&program)
+            .args(arguments)
+            .arg("--json")
+            .env("XDG_CACHE_HOME", &cache)
+            .output()
+            .with_context(|| format!("{} cannot be started", program.display()))?;
+        let said = String::from_utf8_lossy(&output.stderr).into_owned();
+        ensure!(output.status.success(), "{}: {said}", arguments.join(" "));
+        Ok(serde_json::from_slice(&output.stdout)?)
+    };
+    let worlds = ask(&["envs"])?;
+    let worlds = worlds.as_object().context("`envs` answers with no worlds")?;
+    for world in worlds.keys().filter(|world| world.starts_with("lava-point/")) {
+        for eta in ETAS {
+            let answer = ask(&["exact", "--env", world, "--eta", &eta.to_string()])?;
+            let number = |name: &str| answer[name].as_f64().unwrap_or(f64::NAN);
+            println!(
+                "{world}, eta {eta}: {:.4} in [{:.4}, {:.4}], lattice {:.4} +- {:.4}, {:.0} s",
+                number("certified_cvar"),
+                number("certified_cvar_lo"),
+                number("certified_cvar_hi"),
+                number("lattice_value"),
+                number("lattice_error"),
+                number("seconds"),
+            );
+        }
+    }
+    let path = repository.join("configs").join("oracle.json");
+    // An entry on a line, as it is in a file of the cache.
+    let text = fs::read_to_string(&path)?;
+    let mut entries: Vec<String> = (text.lines().filter(|line| line.starts_with('{')))
+        .map(|line| line.trim_end_matches(',').to_owned())
+        .collect();
+    let mut found: Vec<_> = match fs::read_dir(cache.join("cvar-game").join("oracle")) {
+        Ok(files) => files.map(|file| Ok(file?.path())).collect::<Result<_>>()?,
+        Err(_) => Vec::new(),
+    };
+    found.sort();
+    for file in found {
+        let entry = fs::read_to_string(file)?.trim().to_owned();
+        if !entries.contains(&entry) {
+            entries.push(entry);
+        }
+    }
+    fs::write(&path, format!("[\n{}\n]\n", entries.join(",\n")))
+        .with_context(|| format!("{} cannot be written", path.display()))
 }
 
 fn line(row: &Row) -> String {

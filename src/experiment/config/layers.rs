@@ -3,7 +3,7 @@
 use super::annotated::Schema;
 use super::keys::{at, leaves, merge, nested};
 use super::of_run::as_experiment;
-use super::{Catalogue, ConfigError, one_line, scenes};
+use super::{Catalogue, ConfigError, one_line};
 use crate::experiment::names::WorldName;
 use crate::files::read_text;
 use std::path::{Path, PathBuf};
@@ -58,6 +58,7 @@ const EMBEDDED: &[(&str, &str)] = &[
     ("configs/ablations.toml", include_str!("../../../configs/ablations.toml")),
     ("configs/methods.toml", include_str!("../../../configs/methods.toml")),
     ("configs/iqn.toml", include_str!("../../../configs/iqn.toml")),
+    ("configs/suite.toml", include_str!("../../../configs/suite.toml")),
 ];
 
 /// The embedded small benchmark.
@@ -274,29 +275,4 @@ pub(super) fn constants(merged: &Table, world: &str) -> Table {
     };
     table.remove("train");
     table
-}
-
-/// The constants of a world: its defaults, those that a scene of the program sets, `[env.WORLD]` of files and
-/// options, the scene's map, and `[env."WORLD/SCENE"]`.
-pub(super) fn world_constants(
-    catalogue: &Catalogue,
-    stack: &[Layer],
-    world: &WorldName,
-) -> Result<Table, ConfigError> {
-    let Some(name) = world.scene() else {
-        return Ok(constants(&merged(stack), world.base()));
-    };
-    let (default, given) = stack.split_first().expect("the default is the first layer");
-    let given = merged(given);
-    let own = constants(&given, world.as_str());
-    let mut table = constants(&default.table, world.base());
-    let (map, others) = match scenes::shipped(name) {
-        Some(scene) => scene.constants(catalogue.world(world)?)?,
-        None if own.is_empty() => return Err(scenes::unknown(name)),
-        None => (Table::new(), Table::new()),
-    };
-    for over in [others, constants(&given, world.base()), map, own] {
-        merge(&mut table, &over);
-    }
-    Ok(table)
 }

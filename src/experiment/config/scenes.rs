@@ -18,7 +18,7 @@
 
 use super::catalogue::WorldInfo;
 use super::layers::{self, Layer};
-use super::{Catalogue, ConfigError, one_line};
+use super::{Catalogue, ConfigError, keys, one_line};
 use crate::experiment::names::WorldName;
 use crate::files::read_text;
 use lava_envs::map::Map;
@@ -110,7 +110,7 @@ impl Scene {
     ///
     /// # Errors
     /// If the world cannot be laid out as the map, or has no constant of such a name.
-    pub(super) fn constants(&self, world: &WorldInfo) -> Result<(Table, Table), ConfigError> {
+    fn constants(&self, world: &WorldInfo) -> Result<(Table, Table), ConfigError> {
         let refused =
             |message: String| ConfigError::Syntax { origin: self.origin.clone(), message };
         let map = (world.of_map)(&self.map)
@@ -154,8 +154,33 @@ pub fn defaults(world: &WorldInfo, name: &WorldName) -> Option<Table> {
     Some(table)
 }
 
+/// The constants of a world: its defaults, those that a scene of the program sets, `[env.WORLD]` of files and
+/// options, the scene's map, and `[env."WORLD/SCENE"]`.
+pub(super) fn constants(
+    catalogue: &Catalogue,
+    stack: &[Layer],
+    world: &WorldName,
+) -> Result<Table, ConfigError> {
+    let Some(name) = world.scene() else {
+        return Ok(layers::constants(&layers::merged(stack), world.base()));
+    };
+    let (default, given) = stack.split_first().expect("the default is the first layer");
+    let given = layers::merged(given);
+    let own = layers::constants(&given, world.as_str());
+    let (map, others) = match shipped(name) {
+        Some(scene) => scene.constants(catalogue.world(world)?)?,
+        None if own.is_empty() => return Err(unknown(name)),
+        None => (Table::new(), Table::new()),
+    };
+    let mut table = layers::constants(&default.table, world.base());
+    for over in [others, layers::constants(&given, world.base()), map, own] {
+        keys::merge(&mut table, &over);
+    }
+    Ok(table)
+}
+
 /// The refusal of a scene that is not there.
-pub(super) fn unknown(name: &str) -> ConfigError {
+fn unknown(name: &str) -> ConfigError {
     let names: Vec<&str> = SHIPPED.iter().map(|(name, _)| *name).collect();
     ConfigError::UnknownName { kind: "scene", name: name.to_owned(), known: names.join(", ") }
 }
