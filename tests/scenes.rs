@@ -252,3 +252,23 @@ fn the_optimum_of_the_detour_changes_its_way_once() {
 
 /// The budget at which it does, as the scene says.
 const SWITCH: f64 = 2.069;
+
+/// A disc that barely fits finds the way of the map's cells, and one that does not is refused.
+#[test]
+fn a_way_of_cells_is_a_way_for_every_disc_that_fits() {
+    let map = Map::parse("S.#....\n.L#.L#.\n.L...L.\nGLL.L..").unwrap();
+    let mut random = stream(2, Purpose::Outcomes, 0);
+    let laid = |radius: f64, start: [f64; 2]| {
+        let mut table = toml::Table::try_from(PointConfig::default()).unwrap();
+        table.extend(LavaPoint::of_map(&map).unwrap());
+        let config: PointConfig = table.try_into().unwrap();
+        PointConfig { radius, start, ..config }
+    };
+    for _ in 0..50 {
+        let radius = random.random_range(0.01..0.49);
+        laid(radius, [0.5, 0.5]).validate().unwrap();
+        // On the other side of walls and lava.
+        let error = laid(radius, [6.5, 0.5]).validate().unwrap_err().to_string();
+        assert!(error.contains("the disc must reach it"), "{error}");
+    }
+}

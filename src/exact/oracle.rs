@@ -128,9 +128,10 @@ impl Lattice {
     pub fn of(config: &PointConfig) -> Lattice {
         let [width, height] = config.arena;
         let mut fine = (width * height / 7000.0).sqrt();
-        // Where it is about the radius, it is the radius: borders at whole metres then have nodes.
-        if (0.7..1.4).contains(&(fine / config.radius)) {
-            fine = config.radius;
+        // A whole part of the radius, if it is about that or less: borders at whole metres then have nodes.
+        let parts = config.radius / fine;
+        if parts > 0.7 {
+            fine = config.radius / parts.round();
         }
         let fine = fine.min(widest(config));
         let velocity = (config.noise / 3.0).max(config.acceleration / 5.0);

@@ -35,7 +35,8 @@ fn environment(table: &Table, world: &World, block: Block) -> String {
         return String::new();
     }
     let headings = row_headings(table);
-    let titles = headings.iter().copied().chain(columns.iter().map(|(_, column)| column.title));
+    let titles =
+        headings.iter().copied().chain(columns.iter().map(|(_, column)| world.heading(column)));
     let align: String =
         headings.iter().map(|&of| if Some(of) == table.heading { 'l' } else { 'r' }).collect();
     let mut lines = vec![titles.map(escaped).collect::<Vec<String>>()];

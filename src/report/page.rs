@@ -121,7 +121,7 @@ fn one_table(table: &Table, world: &World, block: Block) -> Markup {
             thead { tr {
                 @for heading in row_headings(table) { th scope="col" { button { (heading) } } }
                 @for (_, column) in &columns {
-                    th scope="col" { button title=(column.meaning) { (column.title) } }
+                    th scope="col" { button title=(column.meaning) { (world.heading(column)) } }
                 }
             } }
             tbody {

@@ -6,7 +6,7 @@
 
 use super::runs::{csv_text, number};
 use super::statistics::{Estimate, Interval};
-use super::table::{Block, COLUMNS, Cell, Column, Format, Row, Table, World};
+use super::table::{Block, COLUMNS, Cell, Column, Format, REGRET_TO_ORACLE, Row, Table, World};
 use crate::experiment::artefacts::SCHEMA;
 use comfy_table::{CellAlignment, LineStyle, TableStyle};
 use serde_json::{Value, json};
@@ -68,6 +68,11 @@ pub fn legend(table: &Table, mark: &str) -> Vec<(String, String)> {
         if !column.blocks.is_empty() && table.worlds.iter().any(|world| world.has(place)) {
             legend.push((column.title.to_owned(), column.meaning.to_owned()));
         }
+    }
+    if table.worlds.iter().any(World::has_oracle) {
+        let meaning = "the CVaR_1/eta of the oracle's certified controller minus that of the greedy protagonist: a better \
+                       controller may exist, so that the regret itself is at least this much, up to sampling";
+        legend.push((REGRET_TO_ORACLE.to_owned(), meaning.to_owned()));
     }
     let text = "[low, high] is a 95 % interval. Numbers are means over seeds, their intervals a nested \
                 bootstrap (seeds, then episodes; 2,000 replicates, percentiles). Rates: never \
@@ -201,7 +206,7 @@ impl Terminal {
                 let value = value + if row.best[place] { BEST } else { "" };
                 below.map_or(value.clone(), |below| format!("{value}\n{below}"))
             };
-            std::iter::once(column.title.to_owned()).chain(rows.iter().map(cell)).collect()
+            std::iter::once(world.heading(column).to_owned()).chain(rows.iter().map(cell)).collect()
         };
         let columns: Vec<(usize, &'static Column, Vec<String>)> =
             columns.iter().map(|of| (of.0, of.1, cells(of))).collect();
@@ -352,7 +357,7 @@ impl Render for Markdown {
                 if columns.is_empty() {
                     continue;
                 }
-                let titles = columns.iter().map(|(_, column)| column.title);
+                let titles = columns.iter().map(|(_, column)| world.heading(column));
                 let mut lines: Vec<Vec<String>> = vec![
                     row_headings(table).into_iter().chain(titles).map(str::to_owned).collect(),
                 ];

@@ -74,6 +74,9 @@ use serde::Deserialize;
 use serde::de::DeserializeOwned;
 use std::path::Path;
 
+/// The name of reference rows of certified controllers.
+pub(super) const ORACLE: &str = "oracle";
+
 /// A run that has ended.
 #[derive(Debug, Clone)]
 pub struct Run {
@@ -566,7 +569,7 @@ fn references(runs: &[Run], tasks: &mut Tasks) -> Vec<Run> {
 
 /// A policy that is the best at a budget, measured at that of a run of the same task.
 fn reference(run: &Run, law: ReturnLaw, best_at: f64) -> Run {
-    let whose = if law.episodes().is_none() { "optimum" } else { "oracle" };
+    let whose = if law.episodes().is_none() { "optimum" } else { ORACLE };
     let method =
         if best_at == run.name.eta { whose.to_owned() } else { format!("{whose}{AT_NEUTRAL}") };
     let (protagonist, chance, mean_clearance) = (Mode::Greedy, Chance::Nominal, None);

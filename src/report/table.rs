@@ -10,7 +10,7 @@
 //! interval reaches into its interval.
 
 use super::group::{Group, groups, references};
-use super::runs::{AT_NEUTRAL, Regret, Run, Runs};
+use super::runs::{AT_NEUTRAL, ORACLE, Regret, Run, Runs};
 use super::settings::{Settings, Task, listed};
 use super::statistics::{self, Estimate, Interval};
 use crate::experiment::archive::FIRST_METHOD;
@@ -671,7 +671,22 @@ impl World {
         let number = |row: &Row| !matches!(row.cells[column], Cell::Missing | Cell::Baseline);
         self.rows.iter().any(number)
     }
+
+    /// Whether the best that is known here is a certified controller and not the optimum.
+    pub fn has_oracle(&self) -> bool {
+        self.rows.iter().any(|row| row.reference && row.method.starts_with(ORACLE))
+    }
+
+    /// The heading of a column here.
+    pub fn heading(&self, column: &Column) -> &'static str {
+        if column.key == REGRET && self.has_oracle() { REGRET_TO_ORACLE } else { column.title }
+    }
 }
+
+const REGRET: &str = "regret";
+
+/// The heading of a regret to what may not be the best.
+pub const REGRET_TO_ORACLE: &str = "regret to oracle";
 
 /// The results of one method and variant in one folder.
 pub struct Results<'a> {

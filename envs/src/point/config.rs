@@ -336,7 +336,9 @@ impl PointConfig {
     fn a_goal_is_connected(&self) -> bool {
         let scene = Scene::new(self);
         let room = self.arena.map(|side| side - 2.0 * self.radius);
-        let spacing = self.radius.max(room[0].max(room[1]) / WAYS_ACROSS);
+        // About the radius, and a whole part of a metre: the middles of a map's cells are on the lattice.
+        let spacing = 1.0 / (1.0 / self.radius).ceil();
+        let spacing = spacing.max(room[0].max(room[1]) / WAYS_ACROSS);
         let counts = room.map(|side| (side / spacing).ceil() as usize);
         // The lattice goes through the start, so that a start in a narrow place is on it.
         let at = |[x, y]: [usize; 2]| {
