@@ -541,7 +541,7 @@ fn walls_inside_hold_at_any_speed() {
         for slot in 0..slots {
             let [x, y] = world.position(slot);
             assert!(
-                (2.14..=7.91).contains(&x) && (3.14..=5.86).contains(&y),
+                (2.139..=7.911).contains(&x) && (3.139..=5.861).contains(&y),
                 "{x}, {y} is outside"
             );
             for &[left, top, right, bottom] in &walls {
