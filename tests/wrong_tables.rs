@@ -387,3 +387,22 @@ fn the_page_says_how_its_runs_were_made() {
     assert!(page.contains(manifest["cpu"].as_str().unwrap()));
     assert!(manifest["cores"].as_u64().unwrap() > 0);
 }
+
+/// Runs that differ in one constant of the world are drawn over it; others are not.
+#[test]
+fn what_one_constant_does_is_drawn() {
+    let drawn = |seeds: &[u64]| {
+        let folder = copy(seeds);
+        succeed(program("figures").arg(folder.path()));
+        let path = |name: &str| folder.path().join(format!("figures/lava-grid-slip-{name}.svg"));
+        ["cvar", "regret", "gap"].map(|name| fs::read_to_string(path(name)).ok())
+    };
+    let [cvar, regret, gap] = drawn(&[1, 2, 3]);
+    for (figure, words) in [(cvar, "CVaR_1/eta"), (regret, "regret"), (gap, "antagonist gap")] {
+        let figure = figure.expect("the constant is drawn");
+        for part in [words, ">\nslip", "eta = 25"] {
+            assert!(figure.contains(part), "{words}: no {part:?}");
+        }
+    }
+    assert_eq!(drawn(&[1, 2]), [None, None, None]);
+}

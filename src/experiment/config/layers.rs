@@ -59,6 +59,7 @@ const EMBEDDED: &[(&str, &str)] = &[
     ("configs/methods.toml", include_str!("../../../configs/methods.toml")),
     ("configs/iqn.toml", include_str!("../../../configs/iqn.toml")),
     ("configs/suite.toml", include_str!("../../../configs/suite.toml")),
+    ("configs/noise.toml", include_str!("../../../configs/noise.toml")),
 ];
 
 /// The embedded small benchmark.

@@ -69,6 +69,17 @@ pub fn lines(lines: &[Line], dashed: &[(f64, f64)], titles: (&str, &str)) -> Opt
     named_bands(&names, &found, titles, &[], dashed)
 }
 
+/// The same with a dashed line of each line's colour.
+pub(super) fn named_lines(
+    lines: &[Line],
+    dashed: &[Vec<(f64, f64)>],
+    titles: (&str, &str),
+) -> Option<Picture> {
+    let names: Vec<String> = lines.iter().map(|line| line.title.clone()).collect();
+    let found: Vec<Vec<Band>> = lines.iter().map(|line| over_seeds(&line.seeds)).collect();
+    named_bands(&names, &found, titles, dashed, &[])
+}
+
 /// Bands in one chart, one for each row.
 fn bands(
     panels: &[Panel],

@@ -5,11 +5,13 @@
 //! | learning curves, frontier, cross matrix, regret, budget over time | `curves` |
 //! | worlds of cells: the map, where the protagonist goes, where its antagonists change its moves | `maps` |
 //! | worlds in the plane: trajectories, how the antagonist shifts the noise | `maps` |
+//! | what a constant of the world does, where the runs differ in it | `axis` |
 //! | panels, colours, axes, PNG | `canvas` |
 //!
 //! Every row of the table has one colour (Okabe & Ito's, which the colour-blind can tell apart), and
 //! panels of one figure have one pair of axes.
 
+mod axis;
 mod canvas;
 mod curves;
 mod maps;
@@ -143,6 +145,9 @@ impl Figures {
         let improvement = curves::improvement(panels);
         if improvement.is_some() {
             add("improvement", "probability of improvement", improvement);
+        }
+        for (name, title, picture, caption) in axis::constant(panels, worlds) {
+            add(&name, &title, Some((picture, caption)));
         }
         add("cross", "every policy at every level", curves::cross(panels));
         add("learning", "learning curves", curves::learning(panels));
