@@ -1,6 +1,7 @@
 //! Scenes: every one of the program keeps the promises of a world, in both worlds, and configurations place worlds on
 //! them.
 
+use cvar_game::exact::oracle::{Effort, shipped};
 use cvar_game::experiment::config::{Config, Setting, Source, scenes};
 use cvar_game::experiment::names::RunId;
 use cvar_game::experiment::plan;
@@ -222,6 +223,29 @@ fn the_documented_optima_are_those_of_the_solver() {
         ];
         let found = found.map(|number| format!("{:.4}", number.as_f64().unwrap()));
         assert_eq!(found, row[2..7], "{}", row[1]);
+    }
+}
+
+/// The certificates of lava-point come with the program, and docs/scenes.md has their values.
+#[test]
+fn every_scene_has_shipped_certificates() {
+    let text = std::fs::read_to_string("docs/scenes.md").unwrap();
+    let rows: Vec<Vec<&str>> = (text.lines())
+        .filter(|line| line.starts_with("| `") && line.matches('|').count() == 5)
+        .map(|line| line.split('|').map(|cell| cell.trim().trim_matches('`')).collect())
+        .collect();
+    for (name, _) in scenes::all() {
+        let config = point(&on(&[name], &[]), &format!("lava-point/{name}"));
+        let found = [1.0, 25.0, 100.0].map(|eta| {
+            let certified = shipped(&config, 1.0, eta, &Effort::of(&config))
+                .unwrap_or_else(|| panic!("{name} has no certificate at {eta}"));
+            let best =
+                certified.baselines.iter().map(|script| script.cvar).fold(f64::MIN, f64::max);
+            assert!(certified.certified_cvar >= best, "{name}, eta {eta}: {certified}");
+            format!("{:.3}", certified.certified_cvar)
+        });
+        let row = rows.iter().find(|row| row[1] == name).expect("it has a row");
+        assert_eq!(found, row[2..5], "{name}");
     }
 }
 
