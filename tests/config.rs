@@ -193,6 +193,9 @@ fn bad_values_are_refused_with_key_value_and_range() {
         ("env.lava-point.start=[nan, 1]", ["env.lava-point.start", "a finite number"]),
         ("env.lava-point.start=[20, 1]", ["env.lava-point.start", "must lie in the arena"]),
         ("env.lava-point.start=[0.5, 0.5, 1]", ["start", "a list of 2 numbers"]),
+        ("env.lava-point.walls=[[1, 1]]", ["env.lava-point.walls[0]: ", "array of length 4"]),
+        ("env.lava-point.walls=[[5, 5, 4, 6]]", ["env.lava-point.walls = ", "min < max"]),
+        ("env.lava-point.walls=[0.5]", ["env.lava-point.walls[0]: ", "array of length 4"]),
         ("train.budget_rise", ["--set train.budget_rise", "--set key=value"]),
         ("=3", ["--set =3", "--set key=value"]),
     ] {

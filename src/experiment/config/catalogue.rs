@@ -10,7 +10,7 @@ use crate::game::budget::Eta;
 use crate::learn::options::TrainOptions;
 use lava_envs::World;
 use lava_envs::map::Map;
-use toml::Table;
+use toml::{Table, Value};
 
 /// The part of the annotated default that does not belong to a world or a method.
 const GENERAL: &str = include_str!("../../../configs/default.toml");
@@ -63,7 +63,12 @@ impl WorldInfo {
 /// The constants of a world, checked.
 pub(super) fn constants_of<W: World>(table: Table) -> Result<W::Constants, String> {
     let constants: W::Constants =
-        table.try_into().map_err(|error: toml::de::Error| one_line(error.message()))?;
+        serde_path_to_error::deserialize(Value::Table(table)).map_err(|error| {
+            let place = error.path().to_string();
+            let message = one_line(error.into_inner().message());
+            // A missing or unknown constant is named by the message itself.
+            if place.ends_with(']') { format!("{place}: {message}") } else { message }
+        })?;
     W::validate(&constants).map_err(|error| error.to_string())?;
     Ok(constants)
 }

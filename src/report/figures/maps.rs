@@ -13,6 +13,9 @@ use lava_envs::scene::{Area as Place, AreaKind, Scene};
 use plotters::prelude::*;
 use plotters::style::text_anchor::{HPos, VPos};
 
+/// Least width of a figure with a strip: its words need it.
+const NARROWEST: i32 = 640;
+
 /// Units of the canvas per cell, and per metre of a plane that is not large.
 const UNIT: f64 = 44.0;
 /// Units of the canvas of the longer side of a large plane.
@@ -83,7 +86,9 @@ impl Layout {
 
     fn size(&self) -> (u32, u32) {
         let (width, height) = self.pitch();
-        ((width * self.columns as i32) as u32, (height * self.rows as i32 + self.strip) as u32)
+        let least = if self.strip > 0 { NARROWEST } else { 0 };
+        let width = (width * self.columns as i32).max(least);
+        (width as u32, (height * self.rows as i32 + self.strip) as u32)
     }
 
     fn origin(&self, column: usize, row: usize) -> Origin {
@@ -152,8 +157,10 @@ fn cells(canvas: &Area, grid: &Grid, origin: Origin) -> Drawn {
             canvas.draw(&Rectangle::new(corners, fill(*kind).filled()))?;
         }
         if matches!(kind, Some(AreaKind::Goal | AreaKind::LesserGoal)) {
-            let style = text(TEXT, on(GOAL), HPos::Center, VPos::Center);
-            canvas.draw(&Text::new("G", at(origin, x + 0.5, y + 0.5), style))?;
+            let (letter, fill) =
+                if *kind == Some(AreaKind::Goal) { ("G", GOAL) } else { ("g", LESSER_GOAL) };
+            let style = text(TEXT, on(fill), HPos::Center, VPos::Center);
+            canvas.draw(&Text::new(letter, at(origin, x + 0.5, y + 0.5), style))?;
         }
         canvas.draw(&frame(corners, FAINT.stroke_width(1)))?;
     }
