@@ -6,6 +6,9 @@ use crate::report::group::Measures;
 use crate::report::{Optimum, Worlds};
 use std::collections::BTreeSet;
 
+/// A number of a run.
+type Quantity<'a> = &'a dyn Fn(&Panel, &Measures) -> Option<f64>;
+
 /// A figure's name, headline, picture and caption.
 pub(super) type Drawn = (String, String, Picture, String);
 
@@ -95,12 +98,12 @@ pub(super) fn constant(panels: &[Panel], worlds: &dyn Worlds) -> Vec<Drawn> {
         format!("{method}eta = {}", row.eta)
     };
     let cvar = |panel: &Panel, of: &Measures| of.cvar[panel.group.level(panel.group.alpha())];
-    let quantities: [(&str, &str, &dyn Fn(&Panel, &Measures) -> Option<f64>); 3] = [
+    let quantities: [(&str, &str, Quantity<'_>); 3] = [
         ("cvar", "CVaR_1/eta", &cvar),
         ("regret", "regret", &|_, of| of.regret),
         ("gap", "antagonist gap", &|_, of| of.antagonist_gap),
     ];
-    let draw = |(name, words, of): (&str, &str, &dyn Fn(&Panel, &Measures) -> Option<f64>)| {
+    let draw = |(name, words, of): (&str, &str, Quantity<'_>)| {
         let lines: Vec<Line> =
             rows.iter().map(|row| Line { title: title(row), seeds: row.seeds(of) }).collect();
         let is_cvar = name == "cvar";
