@@ -749,7 +749,7 @@ fn committed_results_make_their_tables_again() {
     let results = Path::new(env!("CARGO_MANIFEST_DIR")).join("results");
     let paper = ["paper", "paper-timeless", "paper-plain"];
     for sweep in
-        paper.iter().chain(&["coordinates", "coordinates-held-out", "ablations", "methods"])
+        paper.iter().chain(&["coordinates", "coordinates-held-out", "ablations", "methods", "suite"])
     {
         let dir = tempfile::tempdir().unwrap();
         let (from, to) = (results.join(sweep), dir.path().join(sweep));
