@@ -748,9 +748,13 @@ fn a_bomb_in_an_archive_is_refused() {
 fn committed_results_make_their_tables_again() {
     let results = Path::new(env!("CARGO_MANIFEST_DIR")).join("results");
     let paper = ["paper", "paper-timeless", "paper-plain"];
-    for sweep in
-        paper.iter().chain(&["coordinates", "coordinates-held-out", "ablations", "methods", "suite"])
-    {
+    for sweep in paper.iter().chain(&[
+        "coordinates",
+        "coordinates-held-out",
+        "ablations",
+        "methods",
+        "suite",
+    ]) {
         let dir = tempfile::tempdir().unwrap();
         let (from, to) = (results.join(sweep), dir.path().join(sweep));
         fs::create_dir(&to).unwrap();

@@ -2,7 +2,7 @@
 //! them.
 
 use cvar_game::exact::oracle::{Effort, shipped};
-use cvar_game::experiment::config::{Config, Setting, Source, scenes};
+use cvar_game::experiment::config::{Config, ConfigError, Setting, Source, scenes};
 use cvar_game::experiment::names::RunId;
 use cvar_game::experiment::plan;
 use cvar_game::experiment::registry::standard;
@@ -13,19 +13,33 @@ use lava_envs::{GridConfig, LavaGrid, LavaPoint, PointConfig, World};
 use rand::RngExt;
 use std::path::Path;
 
-fn on(scenes: &[&str], settings: &[&str]) -> Config {
+fn resolved(scenes: &[&str], settings: &[&str]) -> Result<Config, ConfigError> {
     let settings: Vec<Setting> =
         settings.iter().map(|text| Setting::parse(text).unwrap()).collect();
     let scenes: Vec<String> = scenes.iter().map(|&scene| scene.to_owned()).collect();
-    Config::resolve_on(standard().catalogue(), Source::Default, &settings, &scenes).unwrap()
+    Config::resolve_on(standard().catalogue(), Source::Default, &settings, &scenes)
+}
+
+fn on(scenes: &[&str], settings: &[&str]) -> Config {
+    resolved(scenes, settings).unwrap()
 }
 
 fn refused(scenes: &[&str], settings: &[&str]) -> String {
-    let settings: Vec<Setting> =
-        settings.iter().map(|text| Setting::parse(text).unwrap()).collect();
-    let scenes: Vec<String> = scenes.iter().map(|&scene| scene.to_owned()).collect();
-    let found = Config::resolve_on(standard().catalogue(), Source::Default, &settings, &scenes);
-    found.expect_err("it should be refused").to_string()
+    resolved(scenes, settings).expect_err("it should be refused").to_string()
+}
+
+/// The rows of the table of docs/scenes.md with so many columns of numbers: the scene's name, then these.
+fn documented(columns: usize) -> Vec<Vec<String>> {
+    let text = std::fs::read_to_string("docs/scenes.md").unwrap();
+    let cells = |line: &str| -> Vec<String> {
+        let cells = line.trim_matches('|').split('|');
+        cells.map(|cell| cell.trim().trim_matches('`').to_owned()).collect()
+    };
+    let rows = text.lines().filter(|line| line.starts_with("| `")).map(cells);
+    let rows: Vec<Vec<String>> = rows.filter(|row| row.len() == 1 + columns).collect();
+    let all = scenes::all().map(|(name, _)| name);
+    assert!(all.eq(rows.iter().map(|row| row[0].as_str())), "the documented scenes: {rows:?}");
+    rows
 }
 
 fn grid(config: &Config, name: &str) -> GridConfig {
@@ -206,14 +220,8 @@ fn solved(name: &str, eta: f64) -> serde_json::Value {
 /// The table of docs/scenes.md.
 #[test]
 fn the_documented_optima_are_those_of_the_solver() {
-    let text = std::fs::read_to_string("docs/scenes.md").unwrap();
-    let rows: Vec<Vec<&str>> = (text.lines())
-        .filter(|line| line.starts_with("| `") && line.matches('|').count() == 7)
-        .map(|line| line.split('|').map(|cell| cell.trim().trim_matches('`')).collect())
-        .collect();
-    assert_eq!(rows.len(), scenes::all().count());
-    for row in rows {
-        let [neutral, twentyfifth, hundredth] = [1.0, 25.0, 100.0].map(|eta| solved(row[1], eta));
+    for row in documented(5) {
+        let [neutral, twentyfifth, hundredth] = [1.0, 25.0, 100.0].map(|eta| solved(&row[0], eta));
         let found = [
             &neutral["optimal_cvar"],
             &twentyfifth["optimal_cvar"],
@@ -222,19 +230,15 @@ fn the_documented_optima_are_those_of_the_solver() {
             &hundredth["risk_neutral_cvar"],
         ];
         let found = found.map(|number| format!("{:.4}", number.as_f64().unwrap()));
-        assert_eq!(found, row[2..7], "{}", row[1]);
+        assert_eq!(found, row[1..], "{}", row[0]);
     }
 }
 
 /// The certificates of lava-point come with the program, and docs/scenes.md has their values.
 #[test]
 fn every_scene_has_shipped_certificates() {
-    let text = std::fs::read_to_string("docs/scenes.md").unwrap();
-    let rows: Vec<Vec<&str>> = (text.lines())
-        .filter(|line| line.starts_with("| `") && line.matches('|').count() == 5)
-        .map(|line| line.split('|').map(|cell| cell.trim().trim_matches('`')).collect())
-        .collect();
-    for (name, _) in scenes::all() {
+    for row in documented(3) {
+        let name = row[0].as_str();
         let config = point(&on(&[name], &[]), &format!("lava-point/{name}"));
         let found = [1.0, 25.0, 100.0].map(|eta| {
             let certified = shipped(&config, 1.0, eta, &Effort::of(&config))
@@ -244,8 +248,7 @@ fn every_scene_has_shipped_certificates() {
             assert!(certified.certified_cvar >= best, "{name}, eta {eta}: {certified}");
             format!("{:.3}", certified.certified_cvar)
         });
-        let row = rows.iter().find(|row| row[1] == name).expect("it has a row");
-        assert_eq!(found, row[2..5], "{name}");
+        assert_eq!(found, row[1..], "{name}");
     }
 }
 
@@ -295,4 +298,22 @@ fn a_way_of_cells_is_a_way_for_every_disc_that_fits() {
         let error = laid(radius, [6.5, 0.5]).validate().unwrap_err().to_string();
         assert!(error.contains("the disc must reach it"), "{error}");
     }
+}
+
+/// A variant may have worlds that the experiment does not name; a scene's file holds for them too.
+#[test]
+fn a_file_of_a_scene_holds_for_the_worlds_of_variants() {
+    let folder = tempfile::tempdir().unwrap();
+    let (scene, file) = (folder.path().join("own.toml"), folder.path().join("sweep.toml"));
+    std::fs::write(&scene, "about = \"Own.\"\nmap = \"\"\"\nS.L.G\n.....\n\"\"\"\n").unwrap();
+    let sweep = "[experiment]\nenvs = [\"lava-grid\"]\n\
+                 [[experiment.variant]]\nname = \"a\"\nenvs = [\"lava-point\"]\nset = {}\n";
+    std::fs::write(&file, sweep).unwrap();
+    let scenes = [scene.to_str().unwrap().to_owned()];
+    let source = Source::File(&file);
+    let config = Config::resolve_on(standard().catalogue(), source, &[], &scenes).unwrap();
+    let runs = plan::runs(&config);
+    assert!(runs.iter().all(|id| id.world == "lava-point/own"), "{runs:?}");
+    let constants = config.run(&runs[0]).env.of::<LavaPoint>().unwrap();
+    assert_eq!((constants.arena, constants.start), ([5.0, 2.0], [0.5, 0.5]));
 }

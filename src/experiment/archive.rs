@@ -11,6 +11,7 @@
 
 use super::artefacts::Manifest;
 use super::lock::RunLock;
+use super::names;
 use super::words::{counted, thousands};
 use crate::files::{LARGEST_FILE, read_at_most};
 use std::collections::{BTreeMap, BTreeSet};
@@ -74,7 +75,7 @@ impl RunName {
             [world, method, variant] => (world, *method, Some((*variant).to_owned())),
             _ => return None,
         };
-        let world = world.replace('+', "/");
+        let world = names::of_file(world);
         Some(RunName { world, method: method.to_owned(), variant, eta, seed })
     }
 
@@ -101,7 +102,7 @@ impl RunName {
 impl fmt::Display for RunName {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let label = if self.is_plain() { String::new() } else { format!("/{}", self.label()) };
-        let world = self.world.replace('/', "+");
+        let world = names::as_file(&self.world);
         f.pad(&format!("{world}{label}/eta-{}/seed-{}", self.eta, self.seed))
     }
 }

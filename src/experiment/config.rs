@@ -346,7 +346,7 @@ impl Config {
             layer.check(schema)?;
             files.push(layer);
             for draft in &mut drafts {
-                scenes::place(scenes, &mut draft.envs, catalogue)?;
+                files.push(scenes::place(scenes, &mut draft.envs, catalogue)?);
             }
         }
 

@@ -29,6 +29,21 @@ fn checked(name: &str) -> Result<(), NotAName> {
     if fits { Ok(()) } else { Err(NotAName(name.chars().take(LONGEST).collect())) }
 }
 
+/// The name of a world without its scene.
+pub fn base_of(world: &str) -> &str {
+    world.split_once('/').map_or(world, |(base, _)| base)
+}
+
+/// The name of a world's folder and files: `lava-grid+detour` for `lava-grid/detour`.
+pub fn as_file(world: &str) -> String {
+    world.replace('/', "+")
+}
+
+/// The name of a world by that of its folder.
+pub fn of_file(name: &str) -> String {
+    name.replace('+', "/")
+}
+
 /// A world's name, and that of its scene after a `/`. In a folder's name that is a `+`.
 fn checked_world(name: &str) -> Result<(), NotAName> {
     match name.split_once('/') {
@@ -129,7 +144,7 @@ impl WorldName {
 
     /// The world's name without its scene.
     pub fn base(&self) -> &str {
-        self.0.split_once('/').map_or(&self.0, |(base, _)| base)
+        base_of(&self.0)
     }
 
     /// The name of its scene, if it is not the world's own.
@@ -147,7 +162,7 @@ impl WorldName {
 
     /// The name of its folder and files: `lava-grid+detour`.
     pub fn as_file(&self) -> String {
-        self.0.replace('/', "+")
+        as_file(&self.0)
     }
 }
 
@@ -231,7 +246,7 @@ impl FromStr for RunId {
                 _ => return None,
             };
             let id = RunId {
-                world: world.replace('+', "/").parse().ok()?,
+                world: of_file(world).parse().ok()?,
                 method: method.map_or(Ok(MethodName::GAME), str::parse).ok()?,
                 variant: variant.map(str::parse).transpose().ok()?,
                 eta: eta.strip_prefix("eta-")?.parse().ok()?,

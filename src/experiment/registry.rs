@@ -8,7 +8,7 @@ use super::config::catalogue::MethodChecks;
 use super::config::{Catalogue, MethodInfo, RunConfig, WorldConstants, WorldInfo};
 use super::evaluation::{self, Contestants};
 use super::failure::RunError;
-use super::names::{RunId, WorldName};
+use super::names::{RunId, WorldName, base_of};
 use super::run;
 use super::runner::Report;
 use super::steps::{self, Format};
@@ -116,8 +116,7 @@ impl Registry {
 
     /// The world of a name, on whatever scene, if there is one.
     pub fn named(&self, name: &str) -> Option<&dyn Entry> {
-        let base = name.split_once('/').map_or(name, |(base, _)| base);
-        self.worlds.iter().find(|world| world.name() == base).map(Box::as_ref)
+        self.worlds.iter().find(|world| world.name() == base_of(name)).map(Box::as_ref)
     }
 }
 

@@ -5,6 +5,7 @@ use super::figures::{self, Figure, Line};
 use super::runs::{Run, Runs, csv_text, number};
 use super::{Optimum, ReportError, Worlds, persist, persist_figure, statistics};
 use crate::experiment::config::Shift;
+use crate::experiment::names::as_file;
 use crate::game::returns::ReturnLaw;
 use lava_envs::End;
 use std::path::Path;
@@ -181,7 +182,7 @@ fn drawn(judged: &[Judged<'_>]) -> Vec<Figure> {
             caption += " Dashed: the best policy of each value.";
         }
         Some(Figure {
-            name: format!("{}-{constant}-eta-{eta}", world.replace('/', "+")),
+            name: format!("{}-{constant}-eta-{eta}", as_file(&world)),
             title: format!("{world}, eta = {eta}: another {constant} than in training"),
             caption,
             picture,

@@ -10,6 +10,7 @@ use cvar_game::exact::table::TablePolicy;
 use cvar_game::exact::yardstick::{Comparison, Evidence, Options, Yardstick};
 use cvar_game::experiment::config::{Config, RunConfig, Setting, Source, WorldConstants};
 use cvar_game::experiment::frozen::FrozenOpponent;
+use cvar_game::experiment::names::base_of;
 use cvar_game::experiment::registry;
 use cvar_game::game::budget::{Budget, Eta};
 use cvar_game::game::returns::{ReturnLaw, ReturnSoFar};
@@ -36,8 +37,7 @@ pub static WORLDS: [&dyn AnyWorld; 2] =
 /// If there is none; the error names those that there are.
 pub fn named(name: &str) -> Result<&'static dyn AnyWorld, String> {
     let names = || WORLDS.map(|world| world.name()).join(" and ");
-    let base = name.split_once('/').map_or(name, |(base, _)| base);
-    let found = WORLDS.iter().find(|world| world.name() == base).copied();
+    let found = WORLDS.iter().find(|world| world.name() == base_of(name)).copied();
     found.ok_or_else(|| format!("there is no world {name:?}; there are {}", names()))
 }
 

@@ -2,6 +2,7 @@
 
 use super::rules::{self, Rule};
 use super::{ConfigError, keys, renamed};
+use crate::experiment::names::base_of;
 use std::borrow::Cow;
 use std::collections::BTreeMap;
 use toml::{Table, Value};
@@ -185,8 +186,7 @@ impl Schema {
 }
 
 fn has_world(table: &Table, name: &str) -> bool {
-    let base = name.split_once('/').map_or(name, |(base, _)| base);
-    table.get("env").and_then(|worlds| worlds.get(base)).is_some()
+    table.get("env").and_then(|worlds| worlds.get(base_of(name))).is_some()
 }
 
 fn canonical<'a>(table: &Table, key: &'a str) -> Cow<'a, str> {

@@ -23,8 +23,8 @@ pub(super) fn merge(base: &mut Table, over: &Table) {
     }
 }
 
-/// All values that are not tables, with their dotted keys; `/` is in the name of a world with a scene. An empty table counts as a value, so that
-/// an unknown empty section is found too. A part of a key that is not a plain word is quoted:
+/// All values that are not tables, with their dotted keys; `/` is in the name of a world with a scene. An empty
+/// table counts as a value, so that an unknown empty section is found too. A part of a key that is not a plain word is quoted:
 /// `"train.steps" = 1` is not `train.steps`.
 pub(super) fn leaves(table: &Table) -> Vec<(String, Value)> {
     let is_plain = |of: char| of.is_ascii_alphanumeric() || "_-/".contains(of);

@@ -26,6 +26,7 @@ use super::records::Records;
 use super::runs::Run;
 use super::settings::Task;
 use super::table::Results;
+use crate::experiment::names::as_file;
 
 /// A finished figure.
 #[derive(Debug, Clone, PartialEq)]
@@ -102,7 +103,7 @@ impl Figures {
         let scene = worlds.scene(env, &task.constants);
         let mut add = |name: &str, title: &str, figure: Option<(Picture, String)>| match figure {
             Some((picture, caption)) => self.drawn.push(Figure {
-                name: format!("{}-{name}", env.replace('/', "+")),
+                name: format!("{}-{name}", as_file(env)),
                 title: format!("{env}: {title}"),
                 caption,
                 picture,
