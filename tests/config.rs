@@ -263,8 +263,9 @@ fn shipped(name: &str) -> Config {
 #[test]
 fn the_shipped_configurations_are_valid() {
     let paper = [("paper", 120), ("paper-timeless", 60), ("paper-plain", 120)];
-    let earlier = [("coordinates", 60), ("ablations", 220)];
-    for (name, runs) in [("quick", 18)].into_iter().chain(paper).chain(earlier) {
+    let baselines = [("equal-updates", 40), ("published", 9), ("response", 20)];
+    let earlier = [("coordinates", 60), ("ablations", 270)];
+    for (name, runs) in [("quick", 18)].into_iter().chain(paper).chain(baselines).chain(earlier) {
         let config = shipped(name);
         assert_eq!(plan::runs(&config).len(), runs, "{name}");
     }
@@ -561,7 +562,9 @@ fn committed(folder: &str) -> Vec<RunConfig> {
 
 #[test]
 fn committed_runs_are_those_of_the_shipped_configurations() {
-    for name in ["paper", "paper-timeless", "paper-plain", "coordinates", "ablations"] {
+    let paper = ["paper", "paper-timeless", "paper-plain"];
+    for name in paper.into_iter().chain(["equal-updates", "published", "coordinates", "ablations"])
+    {
         let config = shipped(name);
         let mut planned = plan::runs(&config);
         for run in committed(name) {

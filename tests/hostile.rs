@@ -5,7 +5,7 @@
 mod fuzz;
 
 use cap::Cap;
-use cvar_game::experiment::archive::{self, RunName};
+use cvar_game::experiment::archive::{self, PackedWeights, RunName};
 use cvar_game::experiment::artefacts::{Evaluation, SCHEMA};
 use cvar_game::experiment::config::{Config, RunConfig, Setting, Source};
 use cvar_game::experiment::figure_data::FigureData;
@@ -221,7 +221,7 @@ fn archives(effort: (u32, Duration)) -> u64 {
         fs::write(folder.join("evaluation.json"), evaluation(world)).unwrap();
         fs::write(folder.join("config.toml"), first_run().to_toml()).unwrap();
     }
-    assert_eq!(archive::pack(out.path(), false).unwrap().runs, 2);
+    assert_eq!(archive::pack(out.path(), PackedWeights::None).unwrap().runs, 2);
     let valid = vec![fs::read(out.path().join("runs.zip")).unwrap()];
     fuzz(&inputs(valid, "archives"), effort, |bytes| {
         let parent = tempfile::tempdir().unwrap();

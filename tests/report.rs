@@ -1,10 +1,11 @@
 //! Tables from synthetic results folders with known answers.
 
 use cvar_game::exact::yardstick::Exploitability;
-use cvar_game::experiment::archive;
+use cvar_game::experiment::archive::{self, PackedWeights};
 use cvar_game::experiment::artefacts::{
     Audit, Certificate, Chance, Close, Evaluation, Manifest, Play, SCHEMA,
 };
+use cvar_game::experiment::clock::Clock;
 use cvar_game::experiment::registry::standard;
 use cvar_game::game::returns::{Atom, ReturnLaw};
 use cvar_game::learn::policy::Mode;
@@ -80,6 +81,7 @@ fn manifest(dir: &Path, env: &str, eta: f64, seed: u64, failure: Option<&str>) {
         cpu: "a processor".to_owned(),
         cores: Some(2),
         seconds: 3.0,
+        clock: Some(Clock::Processor),
         steps: 250_000,
         close: (seed != 2).then_some(Close { steps: 10_000 * seed, seconds: 0.5 }),
         notes: Vec::new(),
@@ -562,8 +564,8 @@ fn folders_are_put_side_by_side() {
         for (seed, lost) in (1..).zip(lost) {
             let folder = folder(dir, "lava-point", 2.0, seed);
             let mut text = "steps,end,return,clearance\n".to_owned();
-            text += &"1,lava,-1,0\n".repeat(lost);
-            text += &"1,goal,1,0.5\n".repeat(100 - lost);
+            text += &"1,lava,-1,0\n".repeat(10 * lost);
+            text += &"1,goal,1,0.5\n".repeat(10 * (100 - lost));
             fs::write(folder.join("episodes.csv"), text).unwrap();
         }
     }
@@ -664,7 +666,7 @@ fn packed_runs_are_read_as_if_their_folders_were_there() {
     let text = fs::read(&evaluation).unwrap();
     let before = written(dir.path());
 
-    let summary = archive::pack(dir.path(), false).unwrap();
+    let summary = archive::pack(dir.path(), PackedWeights::None).unwrap();
     assert_eq!((summary.packed, summary.runs), (19, 19));
     // A run that has not ended stays, and so do weights.
     let left = ["lava-grid/eta-25/seed-3", "lava-grid/eta-25/seed-8"].map(|of| dir.path().join(of));
@@ -679,7 +681,7 @@ fn packed_runs_are_read_as_if_their_folders_were_there() {
         .unwrap();
     let changed = written(dir.path());
     assert_ne!(changed, before);
-    let summary = archive::pack(dir.path(), false).unwrap();
+    let summary = archive::pack(dir.path(), PackedWeights::None).unwrap();
     assert_eq!((summary.packed, summary.runs), (1, 19));
     assert_eq!(written(dir.path()), changed);
     // The same files, the same bytes; the name of the folder may be that of this version.
@@ -687,12 +689,12 @@ fn packed_runs_are_read_as_if_their_folders_were_there() {
     fs::create_dir_all(&renamed).unwrap();
     fs::write(renamed.join("evaluation.json"), &text).unwrap();
     manifest(dir.path(), "lava-grid/game", 25.0, 2, None);
-    assert_eq!(archive::pack(dir.path(), false).unwrap().runs, 19);
+    assert_eq!(archive::pack(dir.path(), PackedWeights::None).unwrap().runs, 19);
     assert_eq!(written(dir.path()), before);
     let again = tempfile::tempdir().unwrap();
     realistic(again.path());
     manifest(again.path(), "lava-grid", 25.0, 9, Some("update 17: loss of the antagonist is NaN"));
-    archive::pack(again.path(), false).unwrap();
+    archive::pack(again.path(), PackedWeights::None).unwrap();
     assert_eq!(fs::read(again.path().join("runs.zip")).unwrap(), bytes);
 }
 
@@ -700,7 +702,7 @@ fn packed_runs_are_read_as_if_their_folders_were_there() {
 fn damaged_archives_and_members_are_named() {
     let dir = tempfile::tempdir().unwrap();
     realistic(dir.path());
-    archive::pack(dir.path(), false).unwrap();
+    archive::pack(dir.path(), PackedWeights::None).unwrap();
     let path = dir.path().join("runs.zip");
     let sound = fs::read(&path).unwrap();
     // In the middle of the first member's data.
@@ -716,7 +718,7 @@ fn damaged_archives_and_members_are_named() {
         fs::write(&path, bytes).unwrap();
         let error = report::write(dir.path(), standard(), WIDTH).unwrap_err().to_string();
         assert!(error.contains("runs.zip"), "{error}");
-        assert!(archive::pack(dir.path(), false).is_err());
+        assert!(archive::pack(dir.path(), PackedWeights::None).is_err());
     }
 }
 
@@ -749,6 +751,9 @@ fn committed_results_make_their_tables_again() {
     let results = Path::new(env!("CARGO_MANIFEST_DIR")).join("results");
     let paper = ["paper", "paper-timeless", "paper-plain"];
     for sweep in paper.iter().chain(&[
+        "equal-updates",
+        "published",
+        "response",
         "coordinates",
         "coordinates-held-out",
         "ablations",

@@ -1,7 +1,7 @@
 //! The runner: order, number at a time, failures, what is kept and what is refused; with a mock in
 //! place of training, and with a shell script in place of a worker.
 
-use cvar_game::experiment::archive;
+use cvar_game::experiment::archive::{self, PackedWeights};
 use cvar_game::experiment::artefacts::{Evaluation, Manifest, SCHEMA};
 use cvar_game::experiment::config::{Config, RunConfig, Setting, Source};
 use cvar_game::experiment::lock::RunLock;
@@ -250,7 +250,7 @@ fn a_packed_run_is_finished_and_not_carried_out_again() {
     let out = tempfile::tempdir().unwrap();
     let config = config(&[1, 2]);
     sweep(&config, out.path(), 1, &Mock(succeed), &Stop::default());
-    assert_eq!(archive::pack(out.path(), false).unwrap().packed, 2);
+    assert_eq!(archive::pack(out.path(), PackedWeights::None).unwrap().packed, 2);
     assert!(!out.path().join("lava-grid").exists());
     let evaluation = runner::read_evaluation(&run_folder(out.path(), 2)).unwrap().unwrap();
     assert_eq!(evaluation.seed, 2);
@@ -266,6 +266,26 @@ fn a_packed_run_is_finished_and_not_carried_out_again() {
     assert_eq!(told.first().map(String::as_str), Some("3 started"));
     fs::write(out.path().join("runs.zip"), "damaged").unwrap();
     assert!(prepare(&config, out.path()).unwrap_err().to_string().contains("cannot be read"));
+}
+
+#[test]
+fn weights_of_the_first_seed_are_packed_unless_others_are_asked_for() {
+    let packed = |whose: PackedWeights| {
+        let out = tempfile::tempdir().unwrap();
+        sweep(&config(&[3, 1, 2]), out.path(), 1, &Mock(succeed), &Stop::default());
+        for seed in 1..=3_u8 {
+            fs::write(run_folder(out.path(), seed.into()).join("final.safetensors"), [seed])
+                .unwrap();
+        }
+        archive::pack(out.path(), whose).unwrap();
+        let runs = archive::Store::open(out.path()).unwrap().list().unwrap().runs;
+        assert_eq!(runs.len(), 3);
+        let read = |run: archive::RunFiles| run.read("final.safetensors").unwrap();
+        runs.into_iter().filter_map(read).flatten().collect::<Vec<u8>>()
+    };
+    assert_eq!(packed(PackedWeights::First), [1]);
+    assert_eq!(packed(PackedWeights::All), [1, 2, 3]);
+    assert!(packed(PackedWeights::None).is_empty());
 }
 
 #[test]

@@ -1,5 +1,6 @@
 //! The arguments of the command line.
 
+use crate::experiment::archive::PackedWeights;
 use crate::experiment::artefacts::Chance;
 use crate::experiment::config::Shift;
 use crate::experiment::config::{
@@ -350,9 +351,9 @@ pub struct PackArgs {
     /// Output folder of `bench` or `train`.
     #[arg(value_name = "DIR")]
     pub folder: PathBuf,
-    /// Pack the weights of the players as well.
-    #[arg(long)]
-    pub weights: bool,
+    /// Whose weights are packed as well.
+    #[arg(long, value_name = "WHOSE", default_value = "first", num_args = 0..=1, default_missing_value = "all")]
+    pub weights: PackedWeights,
 }
 
 /// Hand a sweep to Slurm: a job array with one task per run, then a job that writes the table.

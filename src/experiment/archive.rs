@@ -7,7 +7,8 @@
 //! `episodes.csv`) is in it, and otherwise the archive.
 //!
 //! [`pack`] makes the archive. The same files give the same bytes: members are sorted by name, and have
-//! one time, one mode and one level of compression. Weights, checkpoints and event files are not packed.
+//! one time, one mode and one level of compression. Checkpoints and event files are not packed, weights as
+//! [`PackedWeights`] says.
 
 use super::artefacts::Manifest;
 use super::lock::RunLock;
@@ -36,7 +37,7 @@ const RESULTS: [&str; 2] = ["evaluation.json", "episodes.csv"];
 const RECORDS: [&str; 5] =
     ["config.toml", "manifest.json", "progress.csv", "figure_data.json", "exhibits.json"];
 
-/// Weights, which are packed only on request.
+/// The networks at the end of training.
 const WEIGHTS: &str = "final.safetensors";
 
 /// More runs than any sweep has.
@@ -414,13 +415,23 @@ impl fmt::Display for Summary {
     }
 }
 
+/// Whose networks at the end of training are packed.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
+pub enum PackedWeights {
+    /// Nobody's.
+    None,
+    /// Those of the first seed of each row, so that what is said of single policies can be checked.
+    First,
+    /// Those of all runs.
+    All,
+}
+
 /// Packs the finished and the failed runs below `dir` into `DIR/runs.zip`, in addition to those that are in it
-/// already, checks every member, and then removes what was packed. With `weights` the networks at
-/// the end of training are packed, too. Files that are not packed stay where they are.
+/// already, checks every member, and then removes what was packed. Files that are not packed stay where they are.
 ///
 /// # Errors
 /// If a file cannot be read or the archive cannot be written. Nothing has been removed then.
-pub fn pack(dir: &Path, weights: bool) -> Result<Summary, PackError> {
+pub fn pack(dir: &Path, weights: PackedWeights) -> Result<Summary, PackError> {
     let failed = |path: &Path| {
         let path = path.to_owned();
         move |source: io::Error| PackError { path, source }
@@ -430,6 +441,19 @@ pub fn pack(dir: &Path, weights: bool) -> Result<Summary, PackError> {
     let mut folders = Listing::default();
     let unreadable = |(path, source)| PackError { path, source };
     store.descend(dir, "", 0, &mut folders).map_err(unreadable)?;
+
+    let row = |name: &RunName| RunName { seed: 0, ..name.clone() }.key();
+    let mut first: BTreeMap<_, u64> = BTreeMap::new();
+    let packed = store.packed.iter().flat_map(|packed| packed.runs.values().map(|(name, _)| name));
+    for name in folders.runs.iter().map(|run| &run.name).chain(packed) {
+        let seed = first.entry(row(name)).or_insert(name.seed);
+        *seed = name.seed.min(*seed);
+    }
+    let with_weights = |name: &RunName| match weights {
+        PackedWeights::None => false,
+        PackedWeights::First => first[&row(name)] == name.seed,
+        PackedWeights::All => true,
+    };
 
     let mut summary = Summary::default();
     let mut locks = Vec::new();
@@ -446,7 +470,8 @@ pub fn pack(dir: &Path, weights: bool) -> Result<Summary, PackError> {
             let problem = io::Error::other(format!("two folders hold {}", run.name));
             return Err(PackError { path: run.folder, source: problem });
         }
-        for file in RESULTS.iter().chain(&RECORDS).chain(weights.then_some(&WEIGHTS)) {
+        let weights = with_weights(&run.name).then_some(&WEIGHTS);
+        for file in RESULTS.iter().chain(&RECORDS).chain(weights) {
             let source = run.folder.join(file);
             if source.is_file() {
                 members.insert(format!("{}/{file}", run.path), Source::File(source));

@@ -13,9 +13,11 @@
 //! | `checkpoint-<update>.bin` | what an unfinished run continues from, see [`super::checkpoint`] |
 //! | `evaluation.json` | [`Evaluation`]; written last, so that a run with it is finished |
 
+use super::clock::Clock;
 use super::names::RunId;
 use crate::exact::yardstick::{Comparison, Exploitability};
 use crate::game::returns::ReturnLaw;
+use crate::learn::device::Device;
 use crate::learn::policy::Mode;
 use serde::{Deserialize, Serialize};
 use std::num::NonZeroUsize;
@@ -48,10 +50,13 @@ pub struct Manifest {
     /// Number of its cores that the program may use; former versions did not write it.
     #[serde(default)]
     pub cores: Option<usize>,
-    /// Wall-clock seconds of training.
+    /// Seconds of training.
     pub seconds: f64,
-    /// Wall-clock seconds of the evaluation and of the figures' data; `None` before it, and former versions
-    /// did not write it.
+    /// Which time they are of, as the others here; former versions had wall-clock time, beside whatever else ran, and did
+    /// not write it.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub clock: Option<Clock>,
+    /// Seconds of the evaluation and of the figures' data; `None` before it, and former versions did not write it.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub evaluation_seconds: Option<f64>,
     /// Environment steps of training.
@@ -69,17 +74,18 @@ pub struct Manifest {
 
 impl Manifest {
     /// The manifest of a run of this program on this machine.
-    pub fn of(run: &RunId, device: &str, steps: u64, seconds: f64) -> Self {
+    pub fn of(run: &RunId, device: Device, steps: u64, seconds: f64) -> Self {
         Manifest {
             schema: SCHEMA,
             run: run.to_string(),
             version: env!("CARGO_PKG_VERSION").to_owned(),
             commit: option_env!("CVAR_GAME_COMMIT").map(str::to_owned),
             libtorch: cfg!(feature = "torch").then(|| "2.13.0".to_owned()),
-            device: device.to_owned(),
+            device: device.to_string(),
             cpu: processor(),
             cores: std::thread::available_parallelism().ok().map(NonZeroUsize::get),
             seconds,
+            clock: Some(Clock::of(device)),
             evaluation_seconds: None,
             steps,
             close: None,
@@ -94,7 +100,7 @@ impl Manifest {
 pub struct Close {
     /// Environment steps.
     pub steps: u64,
-    /// Wall-clock seconds of training.
+    /// Seconds of training.
     pub seconds: f64,
 }
 
@@ -215,7 +221,7 @@ pub struct Evaluation {
     pub seed: u64,
     /// Environment steps of training.
     pub steps: u64,
-    /// Wall-clock seconds of training.
+    /// Seconds of training.
     pub seconds: f64,
     /// All plays: greedy and sampled, nominal and (eta > 1) antagonist.
     pub plays: Vec<Play>,

@@ -16,6 +16,7 @@
 pub mod archive;
 pub mod artefacts;
 pub mod checkpoint;
+pub mod clock;
 pub mod config;
 pub mod evaluation;
 pub mod failure;

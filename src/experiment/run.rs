@@ -6,6 +6,7 @@
 
 use super::artefacts::{BUILD, Evaluation, Manifest, SCHEMA};
 use super::checkpoint::{self, Checkpoint, CheckpointError};
+use super::clock::Clock;
 use super::config::{EvaluationOptions, RunConfig};
 use super::evaluation::{self, Contestants};
 use super::failure::RunError;
@@ -21,7 +22,7 @@ use std::cell::{Cell, RefCell};
 use std::fs;
 use std::io;
 use std::path::Path;
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 /// A protagonist whose regret is at most this is close to the optimum.
 const CLOSE: f64 = 0.05;
@@ -61,7 +62,7 @@ pub fn execute<W: Arena + Solvable>(
         return trained;
     }
     let (steps, seconds) = (attempt.training.steps(), attempt.seconds());
-    let mut manifest = Manifest::of(&run.id(), &run.device.to_string(), steps, seconds);
+    let mut manifest = Manifest::of(&run.id(), run.device, steps, seconds);
     manifest.close = progress_file::first_close(folder, CLOSE);
     manifest.notes.extend(run.train.rounding());
     manifest.failure = trained.as_ref().err().map(ToString::to_string);
@@ -122,7 +123,9 @@ fn evaluate<W: Arena + Solvable>(
     stop: &Stop,
     report: &mut dyn FnMut(Report),
 ) -> Result<(), RunError> {
-    let (run, begun) = (contestants.run, Instant::now());
+    let run = contestants.run;
+    let clock = Clock::of(run.device);
+    let begun = clock.now();
     // Those of the protocol, and those from which figures are drawn.
     let EvaluationOptions { episodes, figure_episodes, .. } = run.evaluation;
     let of = match contestants.players.opponent() {
@@ -148,7 +151,7 @@ fn evaluate<W: Arena + Solvable>(
     let path = folder.join(figure_data::FILE);
     let text = serde_json::to_vec(&shown).map_err(io::Error::other);
     text.and_then(|text| write_in_place(&path, &text)).map_err(RunError::file(&path))?;
-    manifest.evaluation_seconds = Some(begun.elapsed().as_secs_f64());
+    manifest.evaluation_seconds = Some((clock.now() - begun).as_secs_f64());
     write_json(&folder.join("manifest.json"), &manifest)?;
     let evaluation = Evaluation::new(&run.id(), (manifest.steps, manifest.seconds), found);
     write_json(&folder.join("evaluation.json"), &evaluation)?;
@@ -164,7 +167,8 @@ struct Attempt<'a, W: Arena> {
     meter: Option<evaluation::RegretMeter<W>>,
     /// Seconds of training before this attempt.
     before: f64,
-    start: Instant,
+    clock: Clock,
+    start: Duration,
     /// Of this attempt, in which the regret was measured.
     measuring: Duration,
 }
@@ -183,7 +187,8 @@ impl<'a, W: Arena + Solvable> Attempt<'a, W> {
             Ok((method.begin)(W::new(constants, run.train.parallel_episodes)?, setting))
         };
         let meter = evaluation::regret_meter(constants, run)?;
-        let start = Instant::now();
+        let clock = Clock::of(run.device);
+        let start = clock.now();
         // They belong to the end of an earlier attempt.
         for name in ["manifest.json", "final.safetensors", figure_data::FILE] {
             let path = folder.join(name);
@@ -210,6 +215,7 @@ impl<'a, W: Arena + Solvable> Attempt<'a, W> {
                                 progress,
                                 meter,
                                 before,
+                                clock,
                                 start,
                                 measuring: Duration::ZERO,
                             });
@@ -224,12 +230,12 @@ impl<'a, W: Arena + Solvable> Attempt<'a, W> {
         let progress =
             ProgressFile::create(folder, method.metrics).map_err(RunError::file(&path))?;
         let (training, before, measuring) = (fresh()?, 0.0, Duration::ZERO);
-        Ok(Attempt { run, folder, training, progress, meter, before, start, measuring })
+        Ok(Attempt { run, folder, training, progress, meter, before, clock, start, measuring })
     }
 
     /// Seconds of training so far.
     fn seconds(&self) -> f64 {
-        self.before + (self.start.elapsed() - self.measuring).as_secs_f64()
+        self.before + (self.clock.now() - self.start - self.measuring).as_secs_f64()
     }
 
     fn train(&mut self, stop: &Stop, report: &mut dyn FnMut(Report)) -> Result<(), RunError> {
@@ -264,9 +270,9 @@ impl<'a, W: Arena + Solvable> Attempt<'a, W> {
         if points(after) == points(before) {
             return Ok(None);
         }
-        let begun = Instant::now();
+        let begun = self.clock.now();
         let regret = (meter.measure)(self.training.players());
-        self.measuring += begun.elapsed();
+        self.measuring += self.clock.now() - begun;
         regret
     }
 

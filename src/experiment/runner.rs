@@ -594,7 +594,7 @@ fn record_failure(
     let path = folder.join("manifest.json");
     let written = read_text(&path).ok().and_then(|text| serde_json::from_str(&text).ok());
     let mut manifest =
-        written.unwrap_or_else(|| Manifest::of(&run.id(), &run.device.to_string(), steps, seconds));
+        written.unwrap_or_else(|| Manifest::of(&run.id(), run.device, steps, seconds));
     manifest.failure.get_or_insert_with(|| reason.to_owned());
     let mut text = serde_json::to_string_pretty(&manifest)?;
     text.push('\n');

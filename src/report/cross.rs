@@ -1,8 +1,8 @@
 //! The cross matrix: every policy at every risk level.
 //!
 //! `cross.csv` has one row per world, eta and alpha: `env,eta,alpha,cvar,lo,hi`, where `cvar` is the
-//! mean over seeds of the greedy protagonist's CVaR_alpha under nominal chance, and `lo`, `hi` are the
-//! ends of its 95 % interval (nested bootstrap). Fields are empty where the tail is too thin or, for the
+//! mean, over the seeds that do not fail (all where every one fails), of the greedy protagonist's CVaR_alpha under
+//! nominal chance, and `lo`, `hi` are the ends of its 95 % interval (Student t). Fields are empty where the tail is too thin or, for the
 //! ends, where there are fewer than two seeds. A folder with other methods than `game`, or with variants,
 //! has the column `method` before them.
 

@@ -1,23 +1,17 @@
-//! Runs of one world and eta, measured and bootstrapped: what the tables are computed from.
+//! Runs of one world and eta, measured: what the tables are computed from.
 
-use super::runs::{Regret, Run, Runs};
-use super::statistics::{self, Estimate};
+use super::runs::{Run, Runs};
+use super::statistics::{self, Estimate, Interval};
 use crate::experiment::archive::FIRST_METHOD;
 use crate::experiment::artefacts::Chance;
-use crate::game::returns::ReturnLaw;
+use crate::game::returns::{NORMAL_95, ReturnLaw};
 use crate::learn::policy::Mode;
 use lava_envs::End;
-use lava_envs::random::{self, ChaCha8Rng, Purpose};
-use rand_distr::{Distribution as _, StandardNormal};
 
 /// The risk levels of the cross matrix.
 pub const ALPHAS: [f64; 7] = [1.0, 0.5, 0.25, 0.1, 0.05, 0.04, 0.01];
 
-/// Bootstrap replicates: the noise they leave in an end of an interval is about a twentieth of its
-/// width.
-const REPLICATES: usize = 2000;
-
-/// What is measured of one run, or of its redrawn episodes. `None` where it does not exist.
+/// What is measured of one run. `None` where it does not exist.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Measures {
     /// Set of a failed run without evaluation: all else is `None`.
@@ -59,103 +53,84 @@ pub struct Measures {
 }
 
 /// The four laws of the return that a run is measured by.
-struct Laws {
-    greedy: Option<ReturnLaw>,
-    sampled: Option<ReturnLaw>,
-    game: Option<ReturnLaw>,
-    greedy_game: Option<ReturnLaw>,
+struct Laws<'a> {
+    greedy: Option<&'a ReturnLaw>,
+    sampled: Option<&'a ReturnLaw>,
+    game: Option<&'a ReturnLaw>,
+    greedy_game: Option<&'a ReturnLaw>,
 }
 
-impl Laws {
-    fn of(run: &Run, mut take: impl FnMut(&ReturnLaw) -> ReturnLaw) -> Laws {
-        let greedy = run.law(Mode::Greedy, Chance::Nominal).map(&mut take);
-        let sampled = run.law(Mode::Sampled, Chance::Nominal).map(&mut take);
-        // At eta = 1 the game is the nominal play: the same episodes, not others like them.
-        let (game, greedy_game) = if run.name.eta == 1.0 {
-            (sampled.clone(), greedy.clone())
-        } else {
-            (run.game_law(Mode::Sampled).map(&mut take), run.game_law(Mode::Greedy).map(&mut take))
-        };
-        Laws { greedy, sampled, game, greedy_game }
+impl Laws<'_> {
+    fn of(run: &Run) -> Laws<'_> {
+        Laws {
+            greedy: run.law(Mode::Greedy, Chance::Nominal),
+            sampled: run.law(Mode::Sampled, Chance::Nominal),
+            game: run.game_law(Mode::Sampled),
+            greedy_game: run.game_law(Mode::Greedy),
+        }
     }
 }
 
 impl Measures {
     fn of(run: &Run, alphas: &[f64]) -> Measures {
-        let laws = Laws::of(run, ReturnLaw::clone);
+        let laws = Laws::of(run);
+        let greedy = laws.greedy;
+        let rate = |end| greedy.map(|law| law.probability(end));
+        let cvar =
+            |law: Option<&ReturnLaw>, alpha| law.and_then(|law| statistics::cvar(law, alpha));
+        let sampled_cvar = cvar(laws.sampled, run.alpha());
+        let game_value = laws.game.map(ReturnLaw::mean);
         let certificate = run.evaluation.as_ref().and_then(|evaluation| evaluation.certificate);
         // Without an antagonist there is no gap, though files have a 0.
         let gap = certificate.filter(|_| laws.greedy_game.is_some()).map(|of| of.antagonist_gap);
-        let regret = run.regret.known().map(|(regret, _)| regret);
-        let cvar = statistics::cvar;
-        Measures::new(run, &laws, alphas, regret, gap, cvar)
-    }
-
-    /// The same of redrawn episodes. Certificates come as numbers, whose standard errors stand for
-    /// their episodes.
-    fn redrawn(run: &Run, found: &Measures, alphas: &[f64], random: &mut ChaCha8Rng) -> Measures {
-        let laws = Laws::of(run, |law| statistics::redraw(law, random));
-        let certificate = run.evaluation.as_ref().and_then(|evaluation| evaluation.certificate);
-        let mut noisy = |number: f64, standard_error: f64| {
-            let noise: f64 = StandardNormal.sample(random);
-            number + noise * standard_error
-        };
-        let gap = found
-            .antagonist_gap
-            .and(certificate)
-            .map(|of| noisy(of.antagonist_gap, of.antagonist_gap_standard_error));
-        let regret = match run.regret {
-            // The redrawn episodes have it.
-            Regret::Known { best: Some(best), .. } => {
-                laws.greedy.as_ref().map(|law| best - law.cvar(run.alpha()))
-            }
-            Regret::Known { value, standard_error, .. } => Some(noisy(value, standard_error)),
-            _ => None,
-        };
-        let mut measures =
-            Measures::new(run, &laws, alphas, regret, gap, |law, alpha| Some(law.cvar(alpha)));
-        // A redrawn law counts no episodes; what the original refuses stays refused.
-        for (redrawn, found) in measures.cvar.iter_mut().zip(&found.cvar) {
-            *redrawn = found.and(*redrawn);
-        }
-        measures.sampled_cvar = found.sampled_cvar.and(measures.sampled_cvar);
-        measures.bound_slack = found.bound_slack.and(measures.bound_slack);
-        measures
-    }
-
-    fn new(
-        run: &Run,
-        laws: &Laws,
-        alphas: &[f64],
-        regret: Option<f64>,
-        antagonist_gap: Option<f64>,
-        cvar: impl Fn(&ReturnLaw, f64) -> Option<f64>,
-    ) -> Measures {
-        let greedy = laws.greedy.as_ref();
-        let rate = |end| greedy.map(|law| law.probability(end));
-        let sampled_cvar = laws.sampled.as_ref().and_then(|law| cvar(law, run.alpha()));
-        let game_value = laws.game.as_ref().map(ReturnLaw::mean);
-        let certificate = run.evaluation.as_ref().and_then(|evaluation| evaluation.certificate);
         let exploitability = certificate.and_then(|of| of.exploitability);
         Measures {
             absent: run.evaluation.is_none(),
             mean: greedy.map(ReturnLaw::mean),
-            cvar: alphas.iter().map(|&alpha| greedy.and_then(|law| cvar(law, alpha))).collect(),
+            cvar: alphas.iter().map(|&alpha| cvar(greedy, alpha)).collect(),
             lava: rate(End::Lava),
             goal: rate(End::Goal),
             timeout: rate(End::Timeout),
             steps_to_goal: greedy.and_then(ReturnLaw::steps_to_goal),
             clearance: run.clearance(),
-            sampled_mean: laws.sampled.as_ref().map(ReturnLaw::mean),
+            sampled_mean: laws.sampled.map(ReturnLaw::mean),
             sampled_cvar,
             game_value,
             bound_slack: game_value.zip(sampled_cvar).map(|(value, cvar)| value - cvar),
-            greedy_game_value: laws.greedy_game.as_ref().map(ReturnLaw::mean),
-            regret,
-            antagonist_gap,
+            greedy_game_value: laws.greedy_game.map(ReturnLaw::mean),
+            regret: run.regret.known().map(|(regret, _)| regret),
+            antagonist_gap: gap,
             class_regret: certificate.and_then(|of| of.class_regret),
             response_gain: exploitability.map(|of| of.response_gain),
             exploitability: exploitability.map(|of| of.epsilon),
+        }
+    }
+
+    /// The standard errors that the episodes of the run leave in its measures; `None` where there is no such error.
+    fn errors(run: &Run, alphas: &[f64]) -> Measures {
+        let laws = Laws::of(run);
+        let mean = |law: Option<&ReturnLaw>| law.map(ReturnLaw::mean_standard_error);
+        let cvar = |law: Option<&ReturnLaw>, alpha| law.map(|law| law.cvar_standard_error(alpha));
+        let rate = |end| {
+            let (rate, episodes) = (laws.greedy?.probability(end), laws.greedy?.episodes()?);
+            Some((rate * (1.0 - rate) / episodes as f64).sqrt())
+        };
+        let (game_value, sampled_cvar) = (mean(laws.game), cvar(laws.sampled, run.alpha()));
+        let certificate = run.evaluation.as_ref().and_then(|evaluation| evaluation.certificate);
+        Measures {
+            mean: mean(laws.greedy),
+            cvar: alphas.iter().map(|&alpha| cvar(laws.greedy, alpha)).collect(),
+            lava: rate(End::Lava),
+            goal: rate(End::Goal),
+            timeout: rate(End::Timeout),
+            sampled_mean: mean(laws.sampled),
+            sampled_cvar,
+            game_value,
+            bound_slack: game_value.zip(sampled_cvar).map(|(value, cvar)| value.hypot(cvar)),
+            greedy_game_value: mean(laws.greedy_game),
+            regret: run.regret.known().map(|(_, error)| error),
+            antagonist_gap: certificate.map(|of| of.antagonist_gap_standard_error),
+            ..Measures::default()
         }
     }
 }
@@ -176,11 +151,11 @@ pub struct Group<'a> {
     pub alphas: Vec<f64>,
     /// Of every run.
     pub measures: Vec<Measures>,
-    /// Of every bootstrap replicate, of every run drawn.
-    replicates: Vec<Vec<Measures>>,
+    /// Their standard errors.
+    errors: Vec<Measures>,
 }
 
-/// The runs, measured and bootstrapped, by method and variant, world and eta.
+/// The runs, measured, by method and variant, world and eta.
 pub fn groups(runs: &Runs) -> Vec<Group<'_>> {
     let one_method = runs.runs.iter().all(|run| run.name.method == FIRST_METHOD);
     let method = |run: &Run| {
@@ -218,19 +193,9 @@ pub fn references(runs: &Runs) -> Vec<Group<'_>> {
 impl<'a> Group<'a> {
     fn new(method: Option<String>, runs: &'a [Run], alphas: Vec<f64>) -> Self {
         let (env, eta) = (runs[0].name.world.as_str(), runs[0].name.eta);
-        let measures: Vec<Measures> = runs.iter().map(|run| Measures::of(run, &alphas)).collect();
-        // The stream belongs to the world and eta: intervals do not move when other rows are added, and
-        // methods are redrawn alike.
-        let index = fnv(&format!("{env}/eta-{eta}")) & ((1 << 56) - 1);
-        let mut random = random::stream(0, Purpose::Bootstrap, index);
-        let seeds: Vec<(&Run, &Measures)> = runs.iter().zip(&measures).collect();
-        let replicates = statistics::nested_bootstrap(
-            &seeds,
-            REPLICATES,
-            &mut random,
-            |(run, found), random| Measures::redrawn(run, found, &alphas, random),
-        );
-        Group { method, env, eta, runs, alphas, measures, replicates }
+        let measures = runs.iter().map(|run| Measures::of(run, &alphas)).collect();
+        let errors = runs.iter().map(|run| Measures::errors(run, &alphas)).collect();
+        Group { method, env, eta, runs, alphas, measures, errors }
     }
 
     /// The heading of its panels: `eta = 25`, after its method where there are several.
@@ -239,9 +204,14 @@ impl<'a> Group<'a> {
         format!("{method}eta = {}", self.eta)
     }
 
-    /// Number of runs that failed.
+    /// Number of runs that failed ([`Run::failed`]).
     pub fn failures(&self) -> usize {
-        self.runs.iter().filter(|run| run.failure.is_some()).count()
+        self.runs.iter().filter(|run| run.failed).count()
+    }
+
+    /// The share of runs that failed.
+    pub fn failure_rate(&self) -> Option<Estimate> {
+        share(self.failures(), self.runs.len())
     }
 
     /// Risk level alpha = 1/eta.
@@ -258,36 +228,69 @@ impl<'a> Group<'a> {
         place.expect("every alpha of the world is measured")
     }
 
-    /// Mean over the runs that have the measure, with the nested bootstrap's interval.
+    /// The places of the runs that the statistics are of: those that did not fail or, where all failed, all.
+    fn counted(&self) -> impl Iterator<Item = usize> {
+        let all_failed = self.failures() == self.runs.len();
+        (0..self.runs.len()).filter(move |&place| all_failed || !self.runs[place].failed)
+    }
+
+    /// The measure of the runs that are counted, and the sampling error of one of them (root mean square).
+    fn sample(&self, measure: &impl Fn(&Measures) -> Option<f64>) -> (Vec<f64>, f64) {
+        let found = |place: usize| Some((measure(&self.measures[place])?, place));
+        let found: Vec<(f64, usize)> = self.counted().filter_map(found).collect();
+        let squares: Vec<f64> = (found.iter())
+            .map(|&(_, place)| measure(&self.errors[place]).unwrap_or_default().powi(2))
+            .collect();
+        let error = statistics::mean(&squares).unwrap_or_default().sqrt();
+        (found.into_iter().map(|(value, _)| value).collect(), error)
+    }
+
+    /// Mean over the runs that did not fail and have the measure.
     pub fn mean(&self, measure: impl Fn(&Measures) -> Option<f64>) -> Option<Estimate> {
-        self.estimate(|measures| {
-            statistics::mean(&measures.iter().filter_map(&measure).collect::<Vec<f64>>())
-        })
+        let (values, error) = self.sample(&measure);
+        statistics::mean_estimate(&values, error)
     }
 
-    /// Interquartile mean over all runs.
+    /// CVaR at a level over all runs, failed ones too; `None` where the range of returns is not known.
+    pub fn overall(&self, alpha: f64) -> Option<Estimate> {
+        let level = self.level(alpha);
+        let range = self.runs[0].returns?;
+        let (mut succeeded, mut failed) = (Vec::new(), Vec::new());
+        for (run, measures) in self.runs.iter().zip(&self.measures) {
+            if run.failed {
+                failed.push(measures.cvar[level]);
+            } else {
+                succeeded.push(measures.cvar[level]?);
+            }
+        }
+        let (_, error) = self.sample(&|measures| measures.cvar[level]);
+        statistics::overall(&succeeded, &failed, range, error)
+    }
+
+    /// Interquartile mean over all runs, failed ones too.
     pub fn iqm(&self, measure: impl Fn(&Measures) -> Option<f64>) -> Option<Estimate> {
-        self.estimate(|measures| statistics::iqm(&ranked(measures, &measure)?))
+        let (_, error) = self.sample(&measure);
+        statistics::iqm_estimate(&ranked(&self.measures, &measure)?, error)
     }
 
-    /// A rate over all episodes of all runs. Where Wilson's interval of as many recorded episodes is
-    /// wider than the bootstrap's, as it is for what never happened, it widens it.
+    /// A rate: its mean. Where Wilson's interval of as many recorded episodes is wider than that of the mean, as it is
+    /// for what never happened, it widens it.
     pub fn rate(&self, measure: impl Fn(&Measures) -> Option<f64>) -> Option<Estimate> {
         let mut estimate = self.mean(&measure)?;
         let (mut successes, mut trials) = (0.0, 0.0);
-        for (run, measures) in self.runs.iter().zip(&self.measures) {
-            let law = run.law(Mode::Greedy, Chance::Nominal);
-            if let Some((episodes, rate)) = law.and_then(ReturnLaw::episodes).zip(measure(measures))
+        for place in self.counted() {
+            let law = self.runs[place].law(Mode::Greedy, Chance::Nominal);
+            if let Some((episodes, rate)) =
+                law.and_then(ReturnLaw::episodes).zip(measure(&self.measures[place]))
             {
                 successes += rate * episodes as f64;
                 trials += episodes as f64;
             }
         }
-        if let (Some(interval), Some(wilson)) =
-            (&mut estimate.interval, statistics::wilson(successes, trials))
-        {
-            interval.low = interval.low.min(wilson.low);
-            interval.high = interval.high.max(wilson.high);
+        if let Some(interval) = &mut estimate.interval {
+            let wilson = statistics::wilson(successes, trials).unwrap_or(*interval);
+            interval.low = interval.low.min(wilson.low).max(0.0);
+            interval.high = interval.high.max(wilson.high).min(1.0);
         }
         Some(estimate)
     }
@@ -301,73 +304,78 @@ impl<'a> Group<'a> {
         Some((self.runs[place].name.seed, worst))
     }
 
-    /// CVaR at this group's alpha minus the same of `baseline`, over the seeds that both have.
-    /// The number of these pairs comes with it.
-    pub fn difference(&self, baseline: &Group) -> Option<(Estimate, usize)> {
+    /// CVaR at this group's alpha minus the same of `baseline`, of the seeds at which neither failed.
+    pub fn differences(&self, baseline: &Group) -> Vec<f64> {
         let (own, other) = (self.level(self.alpha()), baseline.level(self.alpha()));
-        let differences: Vec<f64> = (self.runs.iter().zip(&self.measures))
-            .filter_map(|(run, measures)| {
-                let twin = baseline.runs.iter().position(|twin| twin.name.seed == run.name.seed)?;
-                let score = measures.cvar[own]?;
-                Some(score - baseline.measures[twin].cvar[other]?)
-            })
-            .collect();
-        Some((statistics::paired_difference(&differences)?, differences.len()))
+        let difference = |place: usize| {
+            let seed = self.runs[place].name.seed;
+            let twin = baseline.runs.iter().position(|twin| twin.name.seed == seed)?;
+            if self.runs[place].failed || baseline.runs[twin].failed {
+                return None;
+            }
+            Some(self.measures[place].cvar[own]? - baseline.measures[twin].cvar[other]?)
+        };
+        (0..self.runs.len()).filter_map(difference).collect()
     }
 
-    /// CVaR at this group's alpha minus that of a policy which is not one of several seeds, mean over the runs.
+    /// The same over all runs of either, failed ones too, which are not paired.
+    pub fn overall_difference(&self, baseline: &Group) -> Option<Estimate> {
+        let alpha = self.alpha();
+        Some(statistics::difference(self.overall(alpha)?, baseline.overall(alpha)?))
+    }
+
+    /// CVaR at this group's alpha minus that of a policy which is not one of several seeds, mean over the runs that did
+    /// not fail.
     pub fn above(&self, reference: &Group) -> Option<Estimate> {
         let own = self.level(self.alpha());
-        let known = reference.cvar_at(self.alpha())?;
-        self.mean(|measures| Some(measures.cvar[own]? - known))
+        let (known, of_known) = reference.cvar_at(self.alpha())?;
+        let (values, error) = self.sample(&|measures| measures.cvar[own]);
+        let differences: Vec<f64> = values.iter().map(|value| value - known).collect();
+        statistics::mean_estimate(&differences, error.hypot(of_known))
+    }
+
+    /// The same over all runs.
+    pub fn overall_above(&self, reference: &Group) -> Option<Estimate> {
+        let (known, error) = reference.cvar_at(self.alpha())?;
+        let half = NORMAL_95 * error;
+        let interval = Some(Interval { low: known - half, high: known + half });
+        let known = Estimate { value: known, interval };
+        Some(statistics::difference(self.overall(self.alpha())?, known))
     }
 
     /// Share of the runs whose CVaR at this group's alpha is above that of such a policy; a failed run's is not.
     pub fn share_above(&self, reference: &Group) -> Option<Estimate> {
         let own = self.level(self.alpha());
-        let known = reference.cvar_at(self.alpha())?;
-        self.estimate(|measures| {
-            let scores = ranked(measures, &|measures| measures.cvar[own])?;
-            let better: Vec<f64> =
-                scores.iter().map(|&of| f64::from(u8::from(of > known))).collect();
-            statistics::mean(&better)
-        })
+        let (known, _) = reference.cvar_at(self.alpha())?;
+        let scores = ranked(&self.measures, &|measures| measures.cvar[own])?;
+        let above = |(run, score): (&Run, &f64)| !run.failed && *score > known;
+        let better = self.runs.iter().zip(&scores).filter(|&of| above(of)).count();
+        share(better, self.runs.len())
     }
 
-    /// CVaR at one of its levels, of a group of one run.
-    fn cvar_at(&self, alpha: f64) -> Option<f64> {
+    /// CVaR at one of its levels and its standard error, of a group of one run.
+    fn cvar_at(&self, alpha: f64) -> Option<(f64, f64)> {
         let place = self.alphas.iter().position(|&level| level == alpha)?;
-        self.measures.first()?.cvar[place]
+        let (value, error) = (self.measures[0].cvar[place]?, self.errors[0].cvar[place]);
+        Some((value, error.unwrap_or_default()))
     }
 
     /// Probability that a run of this group has a better CVaR at this group's alpha than a run of
-    /// `baseline`; a failed run loses against all but another failed one.
+    /// `baseline`; a failed run without returns loses against all but another one.
     pub fn improvement(&self, baseline: &Group) -> Option<Estimate> {
         let (own, other) = (self.level(self.alpha()), baseline.level(self.alpha()));
-        let compare = |x: &[Measures], y: &[Measures]| {
-            let x = ranked(x, &|measures| measures.cvar[own])?;
-            let y = ranked(y, &|measures| measures.cvar[other])?;
-            statistics::improvement(&x, &y)
-        };
-        let value = compare(&self.measures, &baseline.measures)?;
-        let replicates: Vec<f64> = (self.replicates.iter().zip(&baseline.replicates))
-            .filter_map(|(x, y)| compare(x, y))
-            .collect();
-        let enough = self.runs.len() > 1 && baseline.runs.len() > 1;
-        let interval = statistics::percentile_interval(&replicates).filter(|_| enough);
+        let x = ranked(&self.measures, &|measures| measures.cvar[own])?;
+        let y = ranked(&baseline.measures, &|measures| measures.cvar[other])?;
+        let value = statistics::improvement(&x, &y)?;
+        let interval = statistics::improvement_interval(value, x.len(), y.len());
         Some(Estimate { value, interval })
     }
+}
 
-    fn estimate(&self, statistic: impl Fn(&[Measures]) -> Option<f64>) -> Option<Estimate> {
-        let value = statistic(&self.measures)?;
-        let replicates: Vec<f64> =
-            self.replicates.iter().filter_map(|replicate| statistic(replicate)).collect();
-        // One seed says nothing about the spread between seeds: its episodes alone would make an
-        // interval that is far too narrow.
-        let enough = self.measures.iter().filter(|measures| !measures.absent).count() > 1;
-        let interval = statistics::percentile_interval(&replicates).filter(|_| enough);
-        Some(Estimate { value, interval })
-    }
+/// A share of runs; of one run there is no interval.
+fn share(count: usize, all: usize) -> Option<Estimate> {
+    let interval = statistics::clopper_pearson(count, all).filter(|_| all > 1);
+    (all > 0).then(|| Estimate { value: count as f64 / all as f64, interval })
 }
 
 /// Scores for statistics that rank: a failed run is minus infinity. `None` if a run that did not fail
@@ -375,11 +383,4 @@ impl<'a> Group<'a> {
 fn ranked(measures: &[Measures], measure: &impl Fn(&Measures) -> Option<f64>) -> Option<Vec<f64>> {
     let score = |of: &Measures| if of.absent { Some(f64::NEG_INFINITY) } else { measure(of) };
     measures.iter().map(score).collect()
-}
-
-/// The FNV-1a hash: one number for a name, the same on every machine and in every version.
-fn fnv(name: &str) -> u64 {
-    name.bytes().fold(0xcbf2_9ce4_8422_2325, |hash, byte| {
-        (hash ^ u64::from(byte)).wrapping_mul(0x100_0000_01b3)
-    })
 }

@@ -12,8 +12,7 @@
 //! several folders side by side. Methods and variants in one folder are compared in the same way.
 //! [`shifts::write`] judges the policies where the world is another than in training.
 //!
-//! Nothing is simulated here ([`shifts`] has its caller play), and the only random numbers are those of the bootstrap, whose streams are named:
-//! the same artefacts give the same bytes. What a world looks like, and its exact optima, are asked from
+//! Nothing is simulated here ([`shifts`] has its caller play) and nothing is random: the same artefacts give the same bytes. What a world looks like, and its exact optima, are asked from
 //! [`Worlds`].
 
 pub mod cross;

@@ -74,16 +74,19 @@ pub fn legend(table: &Table, mark: &str) -> Vec<(String, String)> {
                        controller may exist, so that the regret itself is at least this much, up to sampling";
         legend.push((REGRET_TO_ORACLE.to_owned(), meaning.to_owned()));
     }
-    let text = "[low, high] is a 95 % interval. Numbers are means over seeds, their intervals a nested \
-                bootstrap (seeds, then episodes; 2,000 replicates, percentiles). Rates: never \
-                narrower than Wilson's interval of all episodes. gain and difference: Student t over the \
-                paired seeds. With one seed there is none.";
+    let text = "[low, high] is a 95 % interval. Numbers are means over the seeds that do not fail (of all where every \
+                seed fails), with Student t intervals that make room for skew (Hall) and for the sampling error which all \
+                runs share; differences are paired by seed, with Student's t alone. Shares of seeds: Clopper and Pearson. Rates: never narrower than \
+                Wilson's interval of all episodes. IQM: t of a trimmed mean (Yuen). P(better): Newcombe. `all`: with the \
+                failures that the seeds allow. With one seed there is none. What they cover was simulated \
+                (results/coverage.md)";
     legend.push(("intervals".to_owned(), text.to_owned()));
     let text = "does not exist for the row, or is a CVaR whose tail holds fewer than 10 episodes";
     legend.push((MISSING.to_owned(), text.to_owned()));
     if table.worlds.iter().flat_map(|world| &world.rows).any(|row| row.best.contains(&true)) {
         let text = "the best value of its column in the world, or one whose interval reaches into that \
-                    of the best; what is measured at level 1/eta is compared within an eta alone";
+                    of the best; what is measured at level 1/eta is compared within an eta alone. Rows with \
+                    failed seeds are not marked";
         legend.push((mark.to_owned(), text.to_owned()));
     }
     if table.worlds.iter().flat_map(|world| &world.rows).any(|row| row.reference) {

@@ -37,9 +37,9 @@
 //! | `env`, `eta`, `seed` | which run |
 //! | `method`, `variant` | after `env`, where there are other runs than those of the method `game` without a variant |
 //! | `settings` | after them, where runs of one method, variant and world differ in their settings: the label |
-//! | `status` | `finished` or `failed` |
-//! | `steps`, `seconds` | environment steps and wall-clock seconds of training |
-//! | `evaluation_seconds` | wall-clock seconds of the evaluation and of the figures' data; left out where no run has them |
+//! | `status` | `finished`, `failed` (the run stopped with an error), or `no goal`: its greedy protagonist reaches the goal in fewer than half of its episodes, though the best policy that is known does (or none is known) |
+//! | `steps`, `seconds` | environment steps and seconds of training: processor time of its one thread; wall-clock time with a graphics card, and of former versions, whose manifests name no `clock` |
+//! | `evaluation_seconds` | seconds of the evaluation and of the figures' data; left out where no run has them |
 //! | `steps_to_close`, `seconds_to_close` | environment steps and seconds of training when the regret was first measured to be at most 0.05; left out where no run has them |
 //! | `greedy_mean`, `greedy_cvar` | mean and CVaR_alpha of the return J, greedy protagonist, nominal chance |
 //! | `greedy_lava`, `greedy_goal`, `greedy_timeout` | shares of its episodes that end so |
@@ -66,6 +66,7 @@ use crate::experiment::archive::{FIRST_METHOD, RunFiles, RunName, Store};
 use crate::experiment::artefacts::{
     Audit, Certificate, Chance, Close, Evaluation, Manifest, Play, SCHEMA,
 };
+use crate::experiment::clock::Clock;
 use crate::experiment::registry::Limits;
 use crate::game::returns::{Atom, ReturnLaw};
 use crate::learn::policy::Mode;
@@ -86,10 +87,15 @@ pub struct Run {
     pub failure: Option<String>,
     /// Environment steps of training.
     pub steps: u64,
-    /// Wall-clock seconds of training.
+    /// Seconds of training.
     pub seconds: f64,
     /// What the evaluation found; a failed run may have none.
     pub evaluation: Option<Evaluation>,
+    /// Whether it counts as one: it has no evaluation, or its greedy protagonist does not reach the goal in half of its
+    /// episodes, though the best policy that is known does (or none is known).
+    pub failed: bool,
+    /// The least and the greatest return of its task, where they are known.
+    pub returns: Option<[f64; 2]>,
     /// How far it is from the optimum.
     pub regret: Regret,
     /// What it was trained and evaluated on.
@@ -111,9 +117,6 @@ pub enum Regret {
         value: f64,
         /// Its standard error; 0 where it is exact.
         standard_error: f64,
-        /// The best CVaR, where the regret is computed from the run's law of the return; `None` where the
-        /// run's evaluation has it.
-        best: Option<f64>,
     },
     /// The program comes without a certificate for it.
     NotShipped,
@@ -127,7 +130,7 @@ impl Regret {
     /// The regret and its standard error.
     pub fn known(&self) -> Option<(f64, f64)> {
         match *self {
-            Regret::Known { value, standard_error, .. } => Some((value, standard_error)),
+            Regret::Known { value, standard_error } => Some((value, standard_error)),
             _ => None,
         }
     }
@@ -165,7 +168,12 @@ impl Run {
         self.manifest.as_ref()?.close
     }
 
-    /// Wall-clock seconds of the evaluation and of the figures' data.
+    /// Which time its seconds are of; `None` where it is not known.
+    pub fn clock(&self) -> Option<Clock> {
+        self.manifest.as_ref()?.clock
+    }
+
+    /// Seconds of the evaluation and of the figures' data.
     pub fn evaluation_seconds(&self) -> Option<f64> {
         self.manifest.as_ref()?.evaluation_seconds
     }
@@ -267,7 +275,17 @@ const COLUMNS: [Column; 38] = [
     ("eta", |of| Field::Text(of.run.name.eta.to_string())),
     ("seed", |of| Field::Count(Some(of.run.name.seed))),
     ("status", |of| {
-        Field::Text(if of.run.failure.is_some() { "failed" } else { "finished" }.to_owned())
+        let (stopped, failed) = (of.run.failure.is_some(), of.run.failed);
+        Field::Text(
+            if stopped {
+                "failed"
+            } else if failed {
+                "no goal"
+            } else {
+                "finished"
+            }
+            .to_owned(),
+        )
     }),
     ("steps", |of| Field::Count(Some(of.run.steps))),
     ("seconds", |of| Field::Number(Some(of.run.seconds))),
@@ -518,12 +536,27 @@ impl Tasks<'_> {
         &asked.optima[place].1
     }
 
+    /// See [`Run::failed`].
+    fn failed(&mut self, run: &Run) -> bool {
+        let reaches = |law: &ReturnLaw| law.probability(End::Goal) >= 0.5;
+        let Some(law) = run.law(Mode::Greedy, Chance::Nominal) else {
+            return run.evaluation.is_none();
+        };
+        if reaches(law) {
+            return false;
+        }
+        match self.optimum(&run.name.world, &run.settings.task, run.name.eta) {
+            Optimum::Known(best) => reaches(best),
+            _ => true,
+        }
+    }
+
     /// The regret of a run: as it was certified or, where it was not, by its law of the return.
     fn regret(&mut self, run: &Run) -> Regret {
         let evaluation = run.evaluation.as_ref();
         if let Some(found) = evaluation.and_then(|evaluation| evaluation.certificate) {
             let (value, standard_error) = (found.regret, found.regret_standard_error);
-            return Regret::Known { value, standard_error, best: None };
+            return Regret::Known { value, standard_error };
         }
         let alpha = run.alpha();
         let Some(law) = run.law(Mode::Greedy, Chance::Nominal) else { return Regret::None };
@@ -534,7 +567,6 @@ impl Tasks<'_> {
                 Regret::Known {
                     value: best.cvar(alpha) - cvar,
                     standard_error: error.hypot(best.cvar_standard_error(alpha)),
-                    best: Some(best.cvar(alpha)),
                 }
             }
             Optimum::NotShipped => Regret::NotShipped,
@@ -587,6 +619,8 @@ fn reference(run: &Run, law: ReturnLaw, best_at: f64) -> Run {
     Run {
         name: RunName { method, variant: None, seed: 0, ..run.name.clone() },
         failure: None,
+        failed: false,
+        returns: None,
         steps: 0,
         seconds: 0.0,
         evaluation: Some(evaluation),
@@ -624,9 +658,22 @@ fn read_run(files: RunFiles, tasks: &mut Tasks) -> Result<Option<Run>, ReportErr
         .or(manifest.as_ref().map(|of| (of.steps, of.seconds)));
     let (steps, seconds) = trained.unwrap_or_default();
     let (name, label, regret) = (files.name.clone(), None, Regret::None);
-    let mut run =
-        Run { name, failure, steps, seconds, evaluation, regret, settings, label, manifest, files };
+    let mut run = Run {
+        name,
+        failure,
+        failed: false,
+        returns: limits.map(|limits| limits.returns),
+        steps,
+        seconds,
+        evaluation,
+        regret,
+        settings,
+        label,
+        manifest,
+        files,
+    };
     run.regret = tasks.regret(&run);
+    run.failed = tasks.failed(&run);
     Ok(Some(run))
 }
 

@@ -1,33 +1,30 @@
 //! Statistics over seeds: point estimates and 95 % intervals.
 //!
 //! The seed is the unit of replication: it decides whether a run learns at all, and episodes of one
-//! run say nothing about that. Hence three kinds of interval:
+//! run say nothing about that. Runs that learn are alike, and a run that fails is far away from all of them, so that
+//! the mean of a few seeds with failures has no interval of the usual kinds: ten seeds without a failure are what one
+//! sees six times in ten where one run in twenty fails. Hence two questions are kept apart.
 //!
-//! - **Nested bootstrap** ([`nested_bootstrap`], percentile): draw n of the n seeds with replacement;
-//!   for every seed drawn, redraw its episodes; compute the statistic. Episodes are kept as the atoms
-//!   of a [`ReturnLaw`] with their counts, so redrawing all of them is one multinomial draw
-//!   ([`redraw`]). An exact law has no episodes to redraw. The spread between seeds contains the
-//!   noise of their episodes already, so the second level errs on the wide side, slightly when the
-//!   episodes are many.
-//! - **Student t** ([`paired_difference`]) for differences to eta = 1 of the same seed. With few seeds
-//!   the bootstrap over seeds is too narrow: its variance falls short by (n-1)/n, and it does not
-//!   know the heavy tail of a mean of few. Of normal differences a nominal 95 % percentile interval
-//!   covers about 75 % at n = 3 and 90 % at n = 10 (a test here measures it). The t interval covers
-//!   95 % there, and is merely wide where it should be. Runs of one seed share evaluation streams, so
-//!   their common noise cancels in the difference.
-//! - **Wilson** ([`wilson`]) for rates: the bootstrap of an event that never happened is [0, 0].
+//! - How often does a run fail? [`clopper_pearson`], the exact interval of a share. (Wilson's covers 86 % at three
+//!   seeds and 91 % at ten where one run in twenty fails.)
+//! - How good is a run that does not? [`mean_estimate`], Student's t over the seeds that succeed with room for their
+//!   skew; for differences paired by seed, over the pairs in which both succeed, [`student_estimate`]; [`iqm_estimate`],
+//!   the t interval of a trimmed mean.
 //!
-//! So with 3 seeds read the bootstrap intervals of the main table as too narrow.
+//! [`overall`] puts the two together and covers the mean over all runs, failures included. It assumes nothing of failed
+//! runs but the range of returns, and is as wide as that makes it.
 //!
-//! IQM, stratification and probability of improvement follow Agarwal et al., "Deep Reinforcement
-//! Learning at the Edge of the Statistical Precipice" (NeurIPS 2021), and are checked against its
-//! library rliable and SciPy in `tests/report_statistics.rs`.
+//! Evaluations of all runs share their random streams, and a regret to a sampled optimum shares that optimum: this part
+//! of their error does not show in the spread between seeds. Every interval adds the whole sampling error of a run, as
+//! if all of it were shared; where laws are exact there is none.
+//!
+//! What each interval covers, with and without failures, was simulated: `results/coverage.md`, made by
+//! `tests/coverage.rs`. IQM and probability of improvement follow Agarwal et al., "Deep Reinforcement Learning at the
+//! Edge of the Statistical Precipice" (NeurIPS 2021); values are checked against its library rliable and SciPy in
+//! `tests/report_statistics.rs`.
 
-use crate::game::returns::{Atom, NORMAL_95, ReturnLaw};
-use lava_envs::random::ChaCha8Rng;
-use rand::RngExt as _;
-use rand_distr::{Binomial, Distribution as _};
-use statrs::distribution::{ContinuousCDF as _, StudentsT};
+use crate::game::returns::{NORMAL_95, ReturnLaw};
+use statrs::distribution::{Beta, ContinuousCDF as _, StudentsT};
 
 /// Coverage of every interval.
 pub const LEVEL: f64 = 0.95;
@@ -113,17 +110,188 @@ pub fn improvement(x: &[f64], y: &[f64]) -> Option<f64> {
     (pairs > 0.0).then(|| won / pairs)
 }
 
-/// Mean of paired differences with its Student t interval (the reason is in the module's head).
-pub fn paired_difference(differences: &[f64]) -> Option<Estimate> {
-    let value = mean(differences)?;
-    let count = differences.len();
-    let interval = (count > 1).then(|| {
-        let squares: f64 = differences.iter().map(|difference| (difference - value).powi(2)).sum();
-        let error = (squares / (count - 1) as f64 / count as f64).sqrt();
-        let half = student_quantile(count - 1) * error;
+/// The exact interval of a rate from `successes` in `trials` (Clopper and Pearson 1934): it covers at least
+/// [`LEVEL`] whatever the rate is. `None` without trials.
+pub fn clopper_pearson(successes: usize, trials: usize) -> Option<Interval> {
+    let tail = 0.5 * (1.0 - LEVEL);
+    let quantile = |a: usize, b: usize, probability| {
+        Beta::new(a as f64, b as f64).expect("positive shapes").inverse_cdf(probability)
+    };
+    let failures = trials.checked_sub(successes).filter(|_| trials > 0)?;
+    let low = if successes == 0 { 0.0 } else { quantile(successes, failures + 1, tail) };
+    let high = if failures == 0 { 1.0 } else { quantile(successes + 1, failures, 1.0 - tail) };
+    Some(Interval { low, high })
+}
+
+/// Mean with Student's t interval, widened on the side to which the values are skewed: seeds mostly are, many near the
+/// optimum and some far below, and t alone covers 90 % at ten of those. The end there is that of Hall's transformation of
+/// t (1992; Zhou and Gao 2000), if it is further away. `common_error` is the standard error of what all values have in
+/// common.
+pub fn mean_estimate(values: &[f64], common_error: f64) -> Option<Estimate> {
+    let Estimate { value, interval } = student_estimate(values)?;
+    let interval = interval.map(|student| {
+        let [below, above] = skewed_deviations(values).unwrap_or_default();
+        let common = NORMAL_95 * common_error;
+        Interval {
+            low: value - below.max(value - student.low).hypot(common),
+            high: value + above.max(student.high - value).hypot(common),
+        }
+    });
+    Some(Estimate { value, interval })
+}
+
+/// Mean with Student's t interval: for paired differences, whose skew cancels.
+pub fn student_estimate(values: &[f64]) -> Option<Estimate> {
+    let value = mean(values)?;
+    let half = |error: f64| student_quantile(values.len() - 1) * error;
+    let interval = standard_error(values).map(half);
+    let interval = interval.map(|half| Interval { low: value - half, high: value + half });
+    Some(Estimate { value, interval })
+}
+
+/// How far the ends of Hall's interval are below and above the mean; `None` where values do not differ.
+fn skewed_deviations(values: &[f64]) -> Option<[f64; 2]> {
+    let (centre, count) = (mean(values)?, values.len() as f64);
+    let moment = |power| values.iter().map(|of| (of - centre).powi(power)).sum::<f64>() / count;
+    let deviation = moment(2).sqrt();
+    let skewness = moment(3) / deviation.powi(3);
+    let quantile = student_quantile(values.len() - 1) / count.sqrt();
+    // The inverse of T + g T^2 / 3 + g^2 T^3 / 27 + g / 6n with T the studentised mean over sqrt(n), and the skewness g.
+    let inverse = |of: f64| {
+        let root = (1.0 + skewness * (of - skewness / (6.0 * count))).cbrt();
+        3.0 / skewness * (root - 1.0)
+    };
+    let found = [deviation * inverse(quantile), -deviation * inverse(-quantile)];
+    found.iter().all(|of| of.is_finite()).then_some(found)
+}
+
+/// Interquartile mean ([`iqm`]) with the t interval of a trimmed mean (Yuen 1974), whose error is that of the winsorised
+/// values. None where a quarter of the values is no number.
+pub fn iqm_estimate(values: &[f64], common_error: f64) -> Option<Estimate> {
+    let value = iqm(values)?;
+    let sorted = sorted(values);
+    let (count, cut) = (sorted.len(), sorted.len() / 4);
+    let (least, most) = (sorted[cut], sorted[count - 1 - cut]);
+    let winsorised: Vec<f64> = sorted.iter().map(|value| value.clamp(least, most)).collect();
+    let left = count - 2 * cut;
+    let interval = standard_error(&winsorised).filter(|error| error.is_finite() && left > 1);
+    let interval = interval.map(|error| {
+        let scale = (count * (count - 1)) as f64 / (left * (left - 1)) as f64;
+        let half = student_quantile(left - 1) * error * scale.sqrt();
+        let half = half.hypot(NORMAL_95 * common_error);
         Interval { low: value - half, high: value + half }
     });
     Some(Estimate { value, interval })
+}
+
+/// The mean over all runs: those that succeed, and those that fail, whose return is only known to be in a range. A failed
+/// run without a return counts as the least one.
+///
+/// The mean is (1 - p) s + p f, with the share p that fails and the means s and f of either kind. The deviations that the
+/// intervals of p, s and f allow are added as squares (the method of variance estimates recovery, Zou and Donner 2008).
+/// Where no run has failed, f may be as low as the least return.
+pub fn overall(
+    succeeded: &[f64],
+    failed: &[Option<f64>],
+    [least, greatest]: [f64; 2],
+    common_error: f64,
+) -> Option<Estimate> {
+    let failed: Vec<f64> = failed.iter().map(|value| value.unwrap_or(least)).collect();
+    let count = succeeded.len() + failed.len();
+    let rate = clopper_pearson(failed.len(), count)?;
+    let p = failed.len() as f64 / count as f64;
+    let range = Interval { low: least, high: greatest };
+    let part = |values: &[f64]| {
+        let interval = mean_estimate(values, common_error).and_then(|of| of.interval);
+        interval.map_or(range, |of| Interval {
+            low: of.low.clamp(least, greatest),
+            high: of.high.clamp(least, greatest),
+        })
+    };
+    let (s, f) = (part(succeeded), part(&failed));
+    let (s_mean, f_mean) = (mean(succeeded), mean(&failed));
+    let value = (1.0 - p) * s_mean.unwrap_or(0.0) + p * f_mean.unwrap_or(0.0);
+    let distance = (s_mean.unwrap_or(greatest) - f_mean.unwrap_or(least)).max(0.0);
+    let norm = |parts: [f64; 3]| parts.iter().map(|of| of * of).sum::<f64>().sqrt();
+    let below = norm([
+        (1.0 - p) * (s_mean.unwrap_or(s.low) - s.low),
+        p * (f_mean.unwrap_or(f.low) - f.low),
+        (rate.high - p) * distance,
+    ]);
+    let above = norm([
+        (1.0 - p) * (s.high - s_mean.unwrap_or(s.high)),
+        p * (f.high - f_mean.unwrap_or(f.high)),
+        (p - rate.low) * distance,
+    ]);
+    let interval = (count > 1).then(|| Interval {
+        low: (value - below).clamp(least, greatest),
+        high: (value + above).clamp(least, greatest),
+    });
+    Some(Estimate { value, interval })
+}
+
+/// The difference of two independent estimates, by the same method.
+pub fn difference(x: Estimate, y: Estimate) -> Estimate {
+    let interval = x.interval.zip(y.interval).map(|(a, b)| {
+        let value = x.value - y.value;
+        let below = (x.value - a.low).hypot(b.high - y.value);
+        let above = (a.high - x.value).hypot(y.value - b.low);
+        Interval { low: value - below, high: value + above }
+    });
+    Estimate { value: x.value - y.value, interval }
+}
+
+/// The interval of a probability of improvement that `m` runs have shown against `n` others: Newcombe's method 5 (2006),
+/// which inverts the variance of Hanley and McNeil as Wilson's inverts that of a share. It has a width at 0 and 1, too.
+pub fn improvement_interval(probability: f64, m: usize, n: usize) -> Option<Interval> {
+    if m < 2 || n < 2 {
+        return None;
+    }
+    let (m, n) = (m as f64, n as f64);
+    let others = (m + n) / 2.0 - 1.0;
+    let beyond = |of: f64| {
+        let spread = 1.0 + others * ((1.0 - of) / (2.0 - of) + of / (1.0 + of));
+        (of - probability).powi(2) - NORMAL_95.powi(2) * of * (1.0 - of) * spread / (m * n)
+    };
+    // Between the probability, where it is not positive, and the end, where it is not negative.
+    let root = |mut inside: f64, mut outside: f64| {
+        for _ in 0..60 {
+            let middle = 0.5 * (inside + outside);
+            if beyond(middle) > 0.0 { outside = middle } else { inside = middle }
+        }
+        outside
+    };
+    Some(Interval { low: root(probability, 0.0), high: root(probability, 1.0) })
+}
+
+/// The p value of Student's t test that the mean is 0, of both sides. `None` with fewer than two values.
+pub fn student_p(values: &[f64]) -> Option<f64> {
+    let (value, error) = (mean(values)?, standard_error(values)?);
+    if error == 0.0 {
+        return Some(if value == 0.0 { 1.0 } else { 0.0 });
+    }
+    Some(2.0 * student(values.len() - 1).cdf(-(value / error).abs()))
+}
+
+/// Holm's correction of p values for their number (1979): the chance that any true hypothesis among those whose corrected
+/// value is below 0.05 is rejected is at most 5 %.
+pub fn holm(p_values: &[f64]) -> Vec<f64> {
+    let mut order: Vec<usize> = (0..p_values.len()).collect();
+    order.sort_by(|&a, &b| p_values[a].total_cmp(&p_values[b]));
+    let mut corrected = vec![0.0; p_values.len()];
+    let mut reached: f64 = 0.0;
+    for (rank, &place) in order.iter().enumerate() {
+        reached = reached.max((p_values.len() - rank) as f64 * p_values[place]).min(1.0);
+        corrected[place] = reached;
+    }
+    corrected
+}
+
+/// The standard error of a mean; `None` with fewer than two values.
+fn standard_error(values: &[f64]) -> Option<f64> {
+    let (value, count) = (mean(values)?, values.len());
+    let squares: f64 = values.iter().map(|of| (of - value).powi(2)).sum();
+    (count > 1).then(|| (squares / (count - 1) as f64 / count as f64).sqrt())
 }
 
 /// Quantile of Student's t at (1 + LEVEL) / 2 with `freedom` >= 1 degrees of freedom.
@@ -131,60 +299,11 @@ pub fn paired_difference(differences: &[f64]) -> Option<Estimate> {
 /// # Panics
 /// If `freedom` is 0.
 pub fn student_quantile(freedom: usize) -> f64 {
-    let law = StudentsT::new(0.0, 1.0, freedom as f64).expect("at least one degree of freedom");
-    law.inverse_cdf(0.5 * (1.0 + LEVEL))
+    student(freedom).inverse_cdf(0.5 * (1.0 + LEVEL))
 }
 
-/// Redraws the episodes of a law with replacement. An exact law stays what it is.
-///
-/// The answer knows no number of episodes: whether a tail is thick enough is asked of the original.
-pub fn redraw(law: &ReturnLaw, random: &mut ChaCha8Rng) -> ReturnLaw {
-    let Some(episodes) = law.episodes() else { return law.clone() };
-    // A multinomial draw is a chain of binomial ones, each over what the former left.
-    let (mut left, mut mass_left) = (episodes, 1.0);
-    let mut atoms = Vec::with_capacity(law.atoms().len());
-    for (index, atom) in law.atoms().iter().enumerate() {
-        let last = index + 1 == law.atoms().len();
-        let share = if last { 1.0 } else { (atom.mass / mass_left).clamp(0.0, 1.0) };
-        // Binomial::new refuses only probabilities outside [0, 1] and NaN, which 0/0 of a mass that is used up gives.
-        let count = Binomial::new(left, share).map_or(0, |binomial| binomial.sample(random));
-        left -= count;
-        mass_left -= atom.mass;
-        if count > 0 {
-            atoms.push(Atom { mass: count as f64 / episodes as f64, ..*atom });
-        }
-    }
-    ReturnLaw::exact(atoms)
-}
-
-/// Bootstrap replicates of a group of seeds: each is n of the n seeds drawn with replacement, every
-/// one passed through `redraw` (which draws the seed's episodes anew, or just copies a number).
-///
-/// Strata, as rliable has them for tasks, are bootstrapped each on its own and joined replicate by
-/// replicate.
-pub fn nested_bootstrap<S, R>(
-    seeds: &[S],
-    replicates: usize,
-    random: &mut ChaCha8Rng,
-    mut redraw: impl FnMut(&S, &mut ChaCha8Rng) -> R,
-) -> Vec<Vec<R>> {
-    (0..replicates)
-        .map(|_| {
-            (0..seeds.len())
-                .map(|_| {
-                    let seed = &seeds[random.random_range(0..seeds.len())];
-                    redraw(seed, random)
-                })
-                .collect()
-        })
-        .collect()
-}
-
-/// The percentile interval of a statistic from its bootstrap replicates; `None` of nothing.
-pub fn percentile_interval(replicates: &[f64]) -> Option<Interval> {
-    let sorted = sorted(replicates);
-    let tail = 0.5 * (1.0 - LEVEL);
-    Some(Interval { low: quantile(&sorted, tail)?, high: quantile(&sorted, 1.0 - tail)? })
+fn student(freedom: usize) -> StudentsT {
+    StudentsT::new(0.0, 1.0, freedom as f64).expect("at least one degree of freedom")
 }
 
 /// Quantile of ascending values, interpolated linearly (NumPy's default).

@@ -38,7 +38,7 @@ pub enum Block {
     Comparison,
     /// The cross matrix: every policy at every level.
     Cross,
-    /// Wall-clock time.
+    /// Steps and time of training.
     Cost,
 }
 
@@ -54,7 +54,7 @@ impl Block {
             Block::Game => "against eta = 1, the game, certificates",
             Block::Comparison => return format!("against {}", world.first),
             Block::Cross => "CVaR of the greedy protagonist at every level",
-            Block::Cost => "wall-clock time of training",
+            Block::Cost => "what training took",
         }
         .to_owned()
     }
@@ -156,13 +156,26 @@ fn against(
 
 fn gain(group: &Group, baseline: Option<&Group>) -> Cell {
     against(group, baseline, |baseline| {
-        group.difference(baseline).map(|(gain, _)| Cell::Estimate(gain))
+        statistics::student_estimate(&group.differences(baseline)).map(Cell::Estimate)
     })
+}
+
+fn overall_gain(group: &Group, baseline: Option<&Group>) -> Cell {
+    against(group, baseline, |baseline| group.overall_difference(baseline).map(Cell::Estimate))
 }
 
 fn pairs(group: &Group, baseline: Option<&Group>) -> Cell {
     against(group, baseline, |baseline| {
-        group.difference(baseline).map(|(_, pairs)| Cell::Count(pairs as u64))
+        let pairs = group.differences(baseline).len();
+        (pairs > 0).then_some(Cell::Count(pairs as u64))
+    })
+}
+
+/// The p value of a difference; [`correct`] makes Holm's of those of a table.
+fn p_value(group: &Group, baseline: Option<&Group>) -> Cell {
+    against(group, baseline, |baseline| {
+        let value = statistics::student_p(&group.differences(baseline))?;
+        Some(Cell::Estimate(Estimate { value, interval: None }))
     })
 }
 
@@ -175,6 +188,14 @@ fn cost(group: &Group, of: impl Fn(&Run) -> Option<f64>) -> Cell {
     let told = group.runs.iter().filter(|run| run.steps > 0 && run.seconds > 0.0);
     let values: Vec<f64> = told.filter_map(of).collect();
     estimate(statistics::mean(&values).map(|value| Estimate { value, interval: None }))
+}
+
+/// The same of a time. That of former versions, beside whatever else the machine did, cannot be compared.
+fn time(group: &Group, of: impl Fn(&Run) -> Option<f64>) -> Cell {
+    if group.runs.iter().any(|run| run.clock().is_none()) {
+        return Cell::Missing;
+    }
+    cost(group, of)
 }
 
 /// Median over the runs of when they came close to the optimum; none if more than half of them did not.
@@ -209,7 +230,19 @@ const LATER: [&str; 6] = [
 ];
 
 /// The columns, in order. World, eta, alpha, seeds and failures stand before them in every format.
-pub static COLUMNS: [Column; 39] = [
+pub static COLUMNS: [Column; 45] = [
+    Column {
+        key: FAILURE_RATE,
+        title: "failed %",
+        blocks: &[Block::Returns],
+        format: Format::Percent,
+        best: Best::None,
+        meaning: "share of the seeds that fail: the run stopped, or its greedy protagonist reaches the goal in fewer than \
+                  half of its episodes (and the best policy that is known does not). Where a seed fails and others do \
+                  not, the columns that do not say otherwise are of the others",
+        brief: "seeds that do not reach the goal; they are only in the columns `all`, IQM, worst seed and P(better)",
+        compute: |group, _| estimate(group.failure_rate()),
+    },
     Column {
         key: "mean",
         title: "mean",
@@ -229,6 +262,17 @@ pub static COLUMNS: [Column; 39] = [
         meaning: "mean of the worst 1/eta of its returns: what the row was trained for",
         brief: "mean of the worst 1/eta of the returns",
         compute: |group, _| cvar(group, group.alpha()),
+    },
+    Column {
+        key: "cvar_all",
+        title: "CVaR_1/eta, all",
+        blocks: &[Block::Returns],
+        format: Format::Estimate(3),
+        best: Best::None,
+        meaning: "the same over all seeds, failed ones too. Its interval covers what a share of failures as high as the \
+                  seeds allow would do, whatever the failed ones return",
+        brief: "over all seeds, with room for failures that so few seeds do not show",
+        compute: |group, _| estimate(group.overall(group.alpha())),
     },
     Column {
         key: "cvar_0.5",
@@ -326,7 +370,7 @@ pub static COLUMNS: [Column; 39] = [
         blocks: &[Block::Game],
         format: Format::Estimate(3),
         best: Best::HighestOfEta,
-        meaning: "interquartile mean over seeds of CVaR_1/eta: the middle half of the runs",
+        meaning: "interquartile mean over all seeds of CVaR_1/eta: the middle half of the runs",
         brief: "CVaR_1/eta of the middle half of the seeds",
         compute: |group, _| {
             // Of three seeds it is the mean once more.
@@ -352,15 +396,48 @@ pub static COLUMNS: [Column; 39] = [
         },
     },
     Column {
+        key: "gain_best_neutral",
+        title: "gain over best",
+        blocks: &[Block::Game],
+        format: Format::Estimate(3),
+        best: Best::None,
+        meaning: "CVaR_1/eta minus CVaR at that same level of the best risk-neutral policy there is (lava-point: of \
+                  the oracle's): the gain that is due to risk aversion, not to the slack of the learned eta = 1 policy",
+        brief: "CVaR_1/eta over that of the best risk-neutral policy",
+        compute: |group, others| estimate(others.best_neutral.and_then(|best| group.above(best))),
+    },
+    Column {
+        key: "gain_best_neutral_all",
+        title: "gain over best, all",
+        blocks: &[Block::Game],
+        format: Format::Estimate(3),
+        best: Best::None,
+        meaning: "the same over all seeds, failed ones too",
+        brief: "",
+        compute: |group, others| {
+            estimate(others.best_neutral.and_then(|best| group.overall_above(best)))
+        },
+    },
+    Column {
         key: "gain",
         title: "gain",
         blocks: &[Block::Game],
         format: Format::Estimate(3),
         best: Best::None,
         meaning: "CVaR_1/eta minus CVaR at that same level of the eta = 1 policy of the same seed \
-                  (positive: better than eta = 1)",
+                  (positive: better than eta = 1), of the seeds at which neither fails",
         brief: "CVaR_1/eta over that of eta = 1",
         compute: |group, others| gain(group, others.neutral),
+    },
+    Column {
+        key: "gain_all",
+        title: "gain, all",
+        blocks: &[Block::Game],
+        format: Format::Estimate(3),
+        best: Best::None,
+        meaning: "the same difference over all seeds of both rows, failed ones too",
+        brief: "",
+        compute: |group, others| overall_gain(group, others.neutral),
     },
     Column {
         key: "gain_pairs",
@@ -368,7 +445,7 @@ pub static COLUMNS: [Column; 39] = [
         blocks: &[],
         format: Format::Count,
         best: Best::None,
-        meaning: "number of seeds in gain",
+        meaning: "number of seeds in gain: those at which neither row fails",
         brief: "",
         compute: |group, others| pairs(group, others.neutral),
     },
@@ -381,17 +458,6 @@ pub static COLUMNS: [Column; 39] = [
         meaning: "probability that a run of the row beats a run of eta = 1 in CVaR at level 1/eta",
         brief: "probability that a run beats one that it is compared with",
         compute: |group, others| improvement(group, others.neutral),
-    },
-    Column {
-        key: "gain_best_neutral",
-        title: "gain over best",
-        blocks: &[Block::Game],
-        format: Format::Estimate(3),
-        best: Best::None,
-        meaning: "CVaR_1/eta minus CVaR at that same level of the best risk-neutral policy there is (lava-point: of \
-                  the oracle's): the gain that is due to risk aversion, not to the slack of the learned eta = 1 policy",
-        brief: "CVaR_1/eta over that of the best risk-neutral policy",
-        compute: |group, others| estimate(others.best_neutral.and_then(|best| group.above(best))),
     },
     Column {
         key: "share_above_best_neutral",
@@ -446,6 +512,17 @@ pub static COLUMNS: [Column; 39] = [
                   how far the antagonist is from the worst case (0: perfect)",
         brief: "0 for a perfect antagonist",
         compute: |group, _| estimate(group.mean(|measures| measures.antagonist_gap)),
+    },
+    Column {
+        key: "bound_slack",
+        title: "gap, sampled",
+        blocks: &[Block::Game],
+        format: Format::Estimate(4),
+        best: Best::None,
+        meaning: "game value minus CVaR_1/eta of the sampled protagonist: the gap of the antagonist against the protagonist \
+                  that it has learned against; not below 0, else the budget leaks",
+        brief: "the same of the sampled protagonist",
+        compute: |group, _| estimate(group.mean(|measures| measures.bound_slack)),
     },
     Column {
         key: "exploitability",
@@ -509,16 +586,6 @@ pub static COLUMNS: [Column; 39] = [
         compute: |group, _| estimate(group.mean(|measures| measures.sampled_cvar)),
     },
     Column {
-        key: "bound_slack",
-        title: "bound slack",
-        blocks: &[],
-        format: Format::Estimate(3),
-        best: Best::None,
-        meaning: "game value minus CVaR_1/eta of the sampled protagonist: not below 0, else the budget leaks",
-        brief: "",
-        compute: |group, _| estimate(group.mean(|measures| measures.bound_slack)),
-    },
-    Column {
         key: "budget_violations",
         title: "violations",
         blocks: &[],
@@ -539,12 +606,33 @@ pub static COLUMNS: [Column; 39] = [
         compute: |group, others| gain(group, others.first),
     },
     Column {
+        key: "versus_p",
+        title: "Holm p",
+        blocks: &[Block::Comparison],
+        format: Format::Estimate(3),
+        best: Best::None,
+        meaning: "p value of the difference (Student's t test over the pairs), corrected by Holm's method for all \
+                  differences of this file: below 0.05 it is distinguishable from 0 though so many were looked at",
+        brief: "p value of the difference, corrected for their number",
+        compute: |group, others| p_value(group, others.first),
+    },
+    Column {
+        key: "versus_all",
+        title: "difference, all",
+        blocks: &[Block::Comparison],
+        format: Format::Estimate(3),
+        best: Best::None,
+        meaning: "the same difference over all seeds of both rows, failed ones too",
+        brief: "",
+        compute: |group, others| overall_gain(group, others.first),
+    },
+    Column {
         key: "versus_pairs",
         title: "pairs",
         blocks: &[Block::Comparison],
         format: Format::Count,
         best: Best::None,
-        meaning: "number of seeds in difference",
+        meaning: "number of seeds in difference: those at which neither row fails",
         brief: "seeds in the difference",
         compute: |group, others| pairs(group, others.first),
     },
@@ -574,9 +662,10 @@ pub static COLUMNS: [Column; 39] = [
         blocks: &[Block::Cost],
         format: Format::Estimate(1),
         best: Best::None,
-        meaning: "wall-clock seconds of training, mean over seeds",
+        meaning: "seconds of training, mean over seeds: processor time of its one thread (with a graphics card wall-clock \
+                  time); none where a run has wall-clock time beside other work",
         brief: "",
-        compute: |group, _| cost(group, |run| Some(run.seconds)),
+        compute: |group, _| time(group, |run| Some(run.seconds)),
     },
     Column {
         key: "evaluation_seconds",
@@ -584,9 +673,9 @@ pub static COLUMNS: [Column; 39] = [
         blocks: &[Block::Cost],
         format: Format::Estimate(1),
         best: Best::None,
-        meaning: "wall-clock seconds of the evaluation and of the figures' data, mean over seeds",
+        meaning: "the same of the evaluation and of the figures' data",
         brief: "",
-        compute: |group, _| cost(group, Run::evaluation_seconds),
+        compute: |group, _| time(group, Run::evaluation_seconds),
     },
     Column {
         key: "steps_to_close",
@@ -605,9 +694,12 @@ pub static COLUMNS: [Column; 39] = [
         blocks: &[Block::Cost],
         format: Format::Estimate(1),
         best: Best::None,
-        meaning: "the same in wall-clock seconds of training",
+        meaning: "the same in seconds of training",
         brief: "",
-        compute: |group, _| median(group, |close| close.seconds),
+        compute: |group, _| match time(group, |run| Some(run.seconds)) {
+            Cell::Missing => Cell::Missing,
+            _ => median(group, |close| close.seconds),
+        },
     },
     Column {
         key: "steps_per_second",
@@ -615,9 +707,9 @@ pub static COLUMNS: [Column; 39] = [
         blocks: &[Block::Cost],
         format: Format::Estimate(0),
         best: Best::None,
-        meaning: "environment steps per wall-clock second of training, mean over seeds",
+        meaning: "environment steps per second of training, mean over seeds",
         brief: "",
-        compute: |group, _| cost(group, |run| Some(run.steps as f64 / run.seconds)),
+        compute: |group, _| time(group, |run| Some(run.steps as f64 / run.seconds)),
     },
 ];
 
@@ -685,6 +777,8 @@ impl World {
 
 const REGRET: &str = "regret";
 
+const FAILURE_RATE: &str = "failure_rate";
+
 /// The heading of a regret to what may not be the best.
 pub const REGRET_TO_ORACLE: &str = "regret to oracle";
 
@@ -730,7 +824,9 @@ impl<'a> Results<'a> {
             let (folder, notes, references) = (folder.to_owned(), Vec::new(), Vec::new());
             results.push(Results { heading, folder, name, groups: vec![group], references, notes });
         }
-        let own = runs.runs.iter().flat_map(warnings).chain(runs.notes.iter().cloned());
+        let own = (runs.runs.iter().flat_map(warnings))
+            .chain(without_goal(&runs.runs))
+            .chain(runs.notes.iter().cloned());
         let said = |note| if several { format!("{folder}: {note}") } else { note };
         if let Some(first) = results.first_mut() {
             first.notes = own.map(said).collect();
@@ -768,7 +864,8 @@ impl Table {
         let mut names: Vec<&str> = groups().map(|group| group.env).collect();
         names.sort_unstable();
         names.dedup();
-        let worlds: Vec<World> = names.iter().map(|name| world(name, results)).collect();
+        let mut worlds: Vec<World> = names.iter().map(|name| world(name, results)).collect();
+        correct(&mut worlds);
         let mut notes: Vec<String> =
             results.iter().flat_map(|results| results.notes.iter().cloned()).collect();
         for name in &names {
@@ -785,9 +882,8 @@ impl Table {
             );
         } else if fewest < FEW_SEEDS {
             notes.push(format!(
-                "Intervals of rows with {fewest} seeds are too narrow: a nominal 95 % bootstrap interval \
-                 of a mean covers about 75 % with 3 seeds, 90 % with 10. That of gain, a Student t \
-                 interval, keeps its 95 %."
+                "Some rows have only {fewest} seeds. So few hardly show how often a run fails, and their intervals cover \
+                 less than 95 % where seeds are skewed: 91 % with three (results/coverage.md)."
             ));
         }
         let heading = results.iter().find_map(|of| of.heading);
@@ -863,7 +959,8 @@ fn world(name: &str, results: &[Results]) -> World {
         }
         let cell = |column: &Column| {
             let shown = [Block::Returns, Block::Cross].iter().any(|of| column.blocks.contains(of));
-            if shown { (column.compute)(group, &nobody) } else { Cell::Missing }
+            let of_seeds = column.key == FAILURE_RATE;
+            if shown && !of_seeds { (column.compute)(group, &nobody) } else { Cell::Missing }
         };
         let settings = told_apart(&tasks, task);
         let method = run.name.method.clone();
@@ -887,6 +984,22 @@ fn world(name: &str, results: &[Results]) -> World {
     mark(&mut rows);
     let first = first.map_or(results[0].name.clone(), |first| first.name.clone());
     World { name: name.to_owned(), first, rows, episodes: episodes(&all), checks: checks(&all) }
+}
+
+/// Corrects the p values of a table for their number.
+fn correct(worlds: &mut [World]) {
+    let place = COLUMNS.iter().position(|column| column.key == "versus_p").expect("a column");
+    let rows = worlds.iter_mut().flat_map(|world| &mut world.rows);
+    let mut cells: Vec<&mut Estimate> = rows
+        .filter_map(|row| match &mut row.cells[place] {
+            Cell::Estimate(of) => Some(of),
+            _ => None,
+        })
+        .collect();
+    let found: Vec<f64> = cells.iter().map(|of| of.value).collect();
+    for (cell, corrected) in cells.iter_mut().zip(statistics::holm(&found)) {
+        cell.value = corrected;
+    }
 }
 
 /// What tells a task apart from others of its world, such as `slip=0.3`; `None` if there are no others.
@@ -986,7 +1099,8 @@ fn without_regret(world: &str, here: &[&Results]) -> Vec<String> {
 fn mark(rows: &mut [Row]) {
     let tasks = rows.iter().map(|row| row.task + 1).max().unwrap_or_default();
     for task in 0..tasks {
-        let trained = |row: &&mut Row| row.task == task && !row.reference;
+        // What some seeds of a row do not reach is not its best.
+        let trained = |row: &&mut Row| row.task == task && !row.reference && row.failures == 0;
         let mut rows: Vec<&mut Row> = rows.iter_mut().filter(trained).collect();
         for (place, column) in COLUMNS.iter().enumerate() {
             match column.best {
@@ -1023,6 +1137,24 @@ fn mark_among(rows: &mut [&mut Row], place: usize, sign: f64) {
     }
 }
 
+/// The runs that do not reach the goal, by row.
+fn without_goal(runs: &[Run]) -> Option<String> {
+    let failed = runs.iter().filter(|run| run.failed && run.evaluation.is_some());
+    let mut rows: Vec<(String, Vec<String>)> = Vec::new();
+    for run in failed {
+        let (of, seed) = (&run.name, run.name.seed.to_string());
+        let label = run.label.as_ref().map_or(String::new(), |label| format!(", {label}"));
+        let row = format!("{}, {}{label}, eta = {}", of.world, of.label(), of.eta);
+        match rows.last_mut() {
+            Some((last, seeds)) if *last == row => seeds.push(seed),
+            _ => rows.push((row, vec![seed])),
+        }
+    }
+    let said: Vec<String> =
+        rows.iter().map(|(row, seeds)| format!("{row}: {}", seeds.join(", "))).collect();
+    (!said.is_empty()).then(|| format!("Seeds that do not reach the goal: {}.", said.join("; ")))
+}
+
 /// What is wrong with a run.
 fn warnings(run: &Run) -> Vec<String> {
     let mut warnings = Vec::new();
@@ -1031,8 +1163,8 @@ fn warnings(run: &Run) -> Vec<String> {
         let counted = if run.evaluation.is_some() {
             "Its evaluation counts all the same."
         } else {
-            "It has no returns: means are over the other seeds, but IQM, worst seed and P(better) \
-             rank it below all."
+            "It has no returns: IQM, worst seed and P(better) rank it below all, and the columns `all` count it as the \
+             least return that is possible."
         };
         warnings.push(format!("FAILED: {name} ({failure}). {counted}"));
     }

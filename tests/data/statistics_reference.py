@@ -1,9 +1,9 @@
 """Reference values for `src/report/statistics.rs`, from rliable and SciPy.
 
-    python3 -m venv /tmp/venv && /tmp/venv/bin/pip install rliable==1.2.0 scipy 'pandas<3'
+    python3 -m venv /tmp/venv && /tmp/venv/bin/pip install rliable==1.2.0 scipy 'pandas<3' statsmodels
     /tmp/venv/bin/python tests/data/statistics_reference.py > tests/data/statistics_reference.json
 
-Takes about a minute: the bootstraps are long, so that their own noise stays out of the third digit.
+The correction of p values that of statsmodels.
 """
 
 import json
@@ -12,11 +12,9 @@ from importlib.metadata import version
 
 import numpy as np
 import scipy.stats
-from rliable import library, metrics
-
-REPLICATES = 100_000
-# This statistic is slow, and discrete, so that its quantiles hardly move with the replicates.
-REPLICATES_OF_IMPROVEMENT = 20_000
+import scipy.stats.mstats
+from rliable import metrics
+from statsmodels.stats.multitest import multipletests
 
 random = np.random.RandomState(20_260_101)
 
@@ -36,25 +34,28 @@ paired = [
 rates = [(0, 10), (1, 10), (10, 10), (7, 1_000), (800, 100_000), (0, 100_000)]
 
 
-def interval(score, metric, replicates=REPLICATES):
-    _, intervals = library.get_interval_estimates(
-        {"x": score},
-        lambda *s: np.array([metric(*s)]),
-        reps=replicates,
-        random_state=np.random.RandomState(7),
-    )
-    return [float(v) for v in intervals["x"][:, 0]]
+few_rates = [(0, 3), (1, 3), (0, 10), (2, 10), (10, 10), (1, 20)]
+p_values = [[0.01], [0.04, 0.001, 0.03, 0.5], [0.2, 0.2, 0.9], [0.012, 0.011, 0.013, 0.02, 0.0]]
+
+
+def yuen(s):
+    """The interval of a trimmed mean: the t statistic of Yuen (1974) for one sample."""
+    cut, n = len(s) // 4, len(s)
+    left = n - 2 * cut
+    winsorised = scipy.stats.mstats.winsorize(np.sort(s), limits=((cut + 1e-9) / n, (cut + 1e-9) / n))
+    error = np.sqrt(np.var(winsorised, ddof=1) * (n - 1) / (left * (left - 1)))
+    return list(map(float, scipy.stats.t.interval(0.95, left - 1, scipy.stats.trim_mean(s, 0.25), error)))
 
 
 json.dump(
     {
-        "made_by": {name: version(name) for name in ("rliable", "scipy", "numpy", "arch")},
-        "replicates": REPLICATES,
+        "made_by": {name: version(name) for name in ("rliable", "scipy", "numpy", "statsmodels")},
         "samples": [
             {
                 "values": s.tolist(),
                 "iqm": float(scipy.stats.trim_mean(s, 0.25)),
                 "rliable_iqm": float(metrics.aggregate_iqm(s[:, None])),
+                "iqm_interval": yuen(s) if len(s) > 1 else None,
                 "mean": float(s.mean()),
                 "median": float(np.median(s)),
             }
@@ -64,6 +65,11 @@ json.dump(
             {"successes": k, "trials": n, "interval": list(scipy.stats.binomtest(k, n).proportion_ci(method="wilson"))}
             for k, n in rates
         ],
+        "clopper_pearson": [
+            {"successes": k, "trials": n, "interval": list(scipy.stats.binomtest(k, n).proportion_ci(method="exact"))}
+            for k, n in few_rates
+        ],
+        "holm": [{"p": p, "corrected": multipletests(p, method="holm")[1].tolist()} for p in p_values],
         "student": [{"freedom": f, "quantile": float(scipy.stats.t.ppf(0.975, f))} for f in (1, 2, 3, 4, 9, 10, 29, 100)],
         "paired": [
             {
@@ -71,6 +77,7 @@ json.dump(
                 "y": y.tolist(),
                 "difference": float(np.mean(x - y)),
                 "interval": list(map(float, scipy.stats.ttest_rel(x, y).confidence_interval(0.95))),
+                "p": float(scipy.stats.ttest_rel(x, y).pvalue),
             }
             for x, y in paired
         ],
@@ -83,15 +90,6 @@ json.dump(
             }
             for x, y in ((scores, baseline), (tied_x, tied_y))
         ],
-        "bootstrap": {
-            "x": scores.T.tolist(),
-            "y": baseline.T.tolist(),
-            "mean": interval(scores, metrics.aggregate_mean),
-            "iqm": interval(scores, metrics.aggregate_iqm),
-            "improvement": interval(
-                (scores, baseline), metrics.probability_of_improvement, REPLICATES_OF_IMPROVEMENT
-            ),
-        },
     },
     sys.stdout,
     indent=1,

@@ -1,5 +1,5 @@
 //! Chores of the workspace: `cargo xtask torch`, `python`, `wheel`, `speed`, `scaling`, `oracle`,
-//! `certificates`.
+//! `certificates`, `results`.
 //!
 //! Nothing here is needed to build, test or use the program. `torch` provides libtorch, a C++ library of
 //! 480 MB that cargo cannot fetch, and runs a cargo command with the feature `torch`: it fetches the
@@ -10,6 +10,7 @@ mod cache;
 mod libtorch;
 mod oracle;
 mod python;
+mod results;
 mod scaling;
 mod speed;
 mod tools;
@@ -57,6 +58,8 @@ enum Verb {
     /// Compute the certificates of lava-point that come with the program and are not there yet, for every scene; they go to
     /// configs/oracle.json
     Certificates,
+    /// Write results/README.md from its template and the committed tables, and check the claims of docs/claims.md
+    Results,
     /// Measure the speed of training and its parts; the table goes to target/speed.md
     Speed {
         /// Passed on to the benchmarks, such as a filter of their names: `rollout`
@@ -91,6 +94,11 @@ fn run(verb: Verb) -> Result<ExitCode> {
         Verb::Wheel => python::wheel(&repository, &speed::target(&repository)),
         Verb::Scaling => with_program(&repository, scaling::measure),
         Verb::Oracle => with_program(&repository, oracle::measure),
+        Verb::Results => {
+            results::write(&repository)?;
+            results::check_claims(&repository)?;
+            Ok(ExitCode::SUCCESS)
+        }
         Verb::Certificates => with_program(&repository, oracle::certify),
         Verb::Speed { passed_on } => {
             let target = speed::target(&repository);

@@ -266,6 +266,22 @@ def test_the_risk_neutral_optimum_is_that_of_value_iteration(
     assert best.law.steps.max() <= mdp.horizon
 
 
+@pytest.mark.parametrize("name", ["FrozenLake", "FrozenLake8x8", "CliffWalkingSlippery"])
+def test_a_written_table_is_the_same_process(name: str, tmp_path: Path) -> None:
+    mdp = FiniteMDP.from_env(toy(name), 100)
+    mdp.to_csv(tmp_path / "mdp.csv")
+    start = int(np.flatnonzero(mdp.start)[0])
+    again = FiniteMDP.from_csv(tmp_path / "mdp.csv", horizon=100, start=start)
+    for alpha in (1.0, 0.1):
+        assert again.optimum(alpha).cvar == pytest.approx(mdp.optimum(alpha).cvar, abs=1e-12)
+
+
+def test_a_table_with_several_starts_is_not_written(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="start in 2 states"):
+        FiniteMDP([(0, 0, 1, 1.0, 1.0)], horizon=1, start=[0.5, 0.5]).to_csv(tmp_path / "mdp.csv")
+    assert not (tmp_path / "mdp.csv").exists()
+
+
 @pytest.mark.parametrize("name", ["FrozenLake", "FrozenLake8x8"])
 @pytest.mark.parametrize("alpha", [0.9, 0.3, 0.1, 0.05])
 def test_a_return_of_success_or_failure_has_a_closed_form(name: str, alpha: float) -> None:

@@ -276,8 +276,8 @@ pub(super) fn improvement(panels: &[Panel]) -> Option<(Picture, String)> {
         Ok(())
     })?;
     let caption = "The probability that a run of the first method has a higher CVaR_1/eta than a run of the other \
-                   one (at eta = 1, a higher mean), ties counting half: 0.5 is no difference. Band: 95 % bootstrap \
-                   interval over seeds.";
+                   one (at eta = 1, a higher mean), ties counting half: 0.5 is no difference. Band: Newcombe's 95 % \
+                   interval.";
     Some((svg, caption.to_owned()))
 }
 

@@ -254,6 +254,48 @@ class FiniteMDP:
         rows[:, 1] -= rows[:, 1].min()
         return cls(rows, horizon=horizon, gamma=gamma, start=start)
 
+    def to_csv(self, path: str | os.PathLike[str]) -> None:
+        """Writes the transitions for :meth:`from_csv` and for the program's world ``table``.
+
+        ``cvar-game train --env table --file PATH --set env.horizon=T --set env.start=S`` plays the game on it.
+        A transition that ends the episode leads to one of two further states there: to the first one if it
+        pays more than 0, which the program counts as a goal, else to the second one. States that no episode
+        reaches have no transitions in the file.
+
+        Args:
+            path: The file, which is replaced.
+
+        Raises:
+            ValueError: If episodes do not start in a single state, which the world ``table`` needs.
+            OSError: If the file cannot be written.
+        """
+        start = np.flatnonzero(self.start)
+        if len(start) != 1:
+            raise ValueError(f"episodes start in {len(start)} states; the world table has a single start")
+        rows = self._rows[np.isin(self._rows[:, 0], self._reached(int(start[0])))]
+        ends = rows[:, 2] == -1
+        good = ends & (rows[:, 4] > 0.0)
+        rows[good, 2] = self.states
+        rows[ends & ~good, 2] = self.states + good.any()
+        with open(path, "w", newline="", encoding="utf-8") as file:
+            writer = csv.writer(file, lineterminator="\n")
+            writer.writerow(COLUMNS)
+            for state, action, after, probability, reward in rows.tolist():
+                writer.writerow([int(state), int(action), int(after), probability, reward])
+
+    def _reached(self, start: int) -> list[int]:
+        """The states that episodes can reach."""
+        after: dict[int, set[int]] = {}
+        for state, _, to, probability, _ in self._rows.tolist():
+            if probability > 0.0 and to >= 0:
+                after.setdefault(int(state), set()).add(int(to))
+        seen, left = {start}, [start]
+        while left:
+            new = after.get(left.pop(), set()) - seen
+            seen |= new
+            left += new
+        return sorted(seen)
+
     @property
     def states(self) -> int:
         """Number of states S."""
