@@ -240,7 +240,7 @@ pub static COLUMNS: [Column; 45] = [
         meaning: "share of the seeds that fail: the run stopped, or its greedy protagonist reaches the goal in fewer than \
                   half of its episodes (and the best policy that is known does not). Where a seed fails and others do \
                   not, the columns that do not say otherwise are of the others",
-        brief: "seeds that do not reach the goal; they are only in the columns `all`, IQM, worst seed and P(better)",
+        brief: "seeds that do not reach the goal; the other columns are mostly of the others",
         compute: |group, _| estimate(group.failure_rate()),
     },
     Column {
@@ -271,7 +271,7 @@ pub static COLUMNS: [Column; 45] = [
         best: Best::None,
         meaning: "the same over all seeds, failed ones too. Its interval covers what a share of failures as high as the \
                   seeds allow would do, whatever the failed ones return",
-        brief: "over all seeds, with room for failures that so few seeds do not show",
+        brief: "",
         compute: |group, _| estimate(group.overall(group.alpha())),
     },
     Column {
@@ -409,7 +409,7 @@ pub static COLUMNS: [Column; 45] = [
     Column {
         key: "gain_best_neutral_all",
         title: "gain over best, all",
-        blocks: &[Block::Game],
+        blocks: &[],
         format: Format::Estimate(3),
         best: Best::None,
         meaning: "the same over all seeds, failed ones too",
@@ -521,7 +521,7 @@ pub static COLUMNS: [Column; 45] = [
         best: Best::None,
         meaning: "game value minus CVaR_1/eta of the sampled protagonist: the gap of the antagonist against the protagonist \
                   that it has learned against; not below 0, else the budget leaks",
-        brief: "the same of the sampled protagonist",
+        brief: "",
         compute: |group, _| estimate(group.mean(|measures| measures.bound_slack)),
     },
     Column {
