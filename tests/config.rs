@@ -437,12 +437,14 @@ fn every_option_has_a_rule_that_its_default_follows() {
         "env.lava-point.radius",
         "env.lava-point.start",
         "env.lava-point.walls",
+        "env.table.model",
         "experiment.shifts",
         "experiment.variant",
     ];
     assert_eq!(unstated, checked_elsewhere);
     assert_eq!(stated["train.family.count"], format!("Range: [1, {MOST}]"));
-    let worlds = "One of: \"lava-grid\", \"lava-point\", \"lava-grid/SCENE\", \"lava-point/SCENE\"";
+    let worlds = "One of: \"lava-grid\", \"lava-point\", \"table\", \"lava-grid/SCENE\", \
+                  \"lava-point/SCENE\", \"table/SCENE\"";
     assert_eq!(stated["experiment.envs"], worlds);
     assert!(!standard().catalogue().annotated_default().contains("of the program\n"));
 }

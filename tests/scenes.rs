@@ -234,6 +234,23 @@ fn the_documented_optima_are_those_of_the_solver() {
     }
 }
 
+/// On five scenes, against `tests/data/scene_optima.py`.
+#[test]
+fn the_optima_are_those_of_an_independent_programme() {
+    let reference: serde_json::Value =
+        serde_json::from_str(include_str!("data/scene_optima.json")).unwrap();
+    let etas: Vec<f64> = serde_json::from_value(reference["etas"].clone()).unwrap();
+    let scenes = reference["scenes"].as_object().unwrap();
+    assert_eq!(scenes.len(), 5);
+    for (name, expected) in scenes {
+        for (place, &eta) in etas.iter().enumerate() {
+            let found = solved(name, eta)["optimal_cvar"].as_f64().unwrap();
+            let expected = expected[place].as_f64().unwrap();
+            assert!((found - expected).abs() < 1e-9, "{name}, eta {eta}: {found}, {expected}");
+        }
+    }
+}
+
 /// The certificates of lava-point come with the program, and docs/scenes.md has their values.
 #[test]
 fn every_scene_has_shipped_certificates() {

@@ -16,6 +16,14 @@ pub enum ConfigError {
         /// The values that are allowed.
         allowed: String,
     },
+    /// A table of transitions that is no process; lines count from 1, as an editor shows them.
+    #[error("model, line {line}: {problem}")]
+    Model {
+        /// Line in the text, from 1.
+        line: u64,
+        /// What is wrong.
+        problem: String,
+    },
     /// A picture that is no map; row and column count from 1, as an editor shows them.
     #[error("map, row {row}, column {column}: {problem}; {remedy}")]
     Map {

@@ -1,4 +1,4 @@
-//! Two worlds with lava in which chance is explicit.
+//! Worlds in which chance is explicit: two with lava, and any finite Markov decision process.
 //!
 //! A step of every [`World`] has two halves. [`World::law`] gives the nominal law P_t of what
 //! chance may decide after the protagonist has chosen its action; [`World::apply`] carries out one
@@ -14,6 +14,7 @@ pub mod map;
 pub mod point;
 pub mod random;
 pub mod scene;
+pub mod table;
 pub mod world;
 
 pub use action::{Action, Discrete};
@@ -23,4 +24,5 @@ pub use grid::{GridConfig, LavaGrid, Move};
 pub use law::{FiniteLaw, GaussianLaw, Law};
 pub use point::{Force, LavaPoint, PointConfig};
 pub use scene::{Area, AreaKind, Field, Scene};
+pub use table::{Table, TableConfig};
 pub use world::{End, Outcome, Step, World};

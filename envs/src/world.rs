@@ -77,6 +77,17 @@ pub trait World: Sized + Send + Sync + 'static {
     /// show them in finer detail; 0 shows all numbers as they are.
     const POSITIONS: usize = 0;
 
+    /// Whether experiments that name no worlds play it.
+    const IN_BENCHMARK: bool = true;
+
+    /// The constants that make this world play a table of transitions, to be written over others.
+    ///
+    /// # Errors
+    /// If the world is not played on tables, or the text is none, with the reason.
+    fn of_model(_text: &str) -> Result<toml::Table, String> {
+        Err("it is not played on tables of transitions".to_owned())
+    }
+
     /// The constants that lay this world out as a map, to be written over others.
     ///
     /// # Errors

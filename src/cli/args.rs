@@ -79,6 +79,9 @@ pub struct Overrides {
     /// repeated.
     #[arg(long = "scene", value_name = "NAME|FILE")]
     pub scenes: Vec<String>,
+    /// Plays the world `table` on the transitions in this CSV file. May be repeated.
+    #[arg(long = "file", value_name = "CSV")]
+    pub files: Vec<String>,
 }
 
 impl Overrides {
@@ -96,7 +99,8 @@ impl Overrides {
             self.settings.iter().map(|text| Setting::parse(text)).collect();
         let mut settings = settings?;
         settings.extend(options);
-        Config::resolve_on(catalogue, file, &settings, &self.scenes)
+        let scenes = [&self.scenes[..], &self.files].concat();
+        Config::resolve_on(catalogue, file, &settings, &scenes)
     }
 }
 
@@ -262,7 +266,7 @@ pub struct ExactArgs {
     pub eta: Option<f64>,
     /// A finished run's folder, in a finite world: what every single change of its policy is worth, in one cell
     /// another action. At the run's budget, or at --eta.
-    #[arg(long, value_name = "RUN", conflicts_with_all = ["env", "config", "cell", "velocity", "anew", "settings", "scenes"])]
+    #[arg(long, value_name = "RUN", conflicts_with_all = ["env", "config", "cell", "velocity", "anew", "settings", "scenes", "files"])]
     pub policy: Option<PathBuf>,
     /// Configuration file.
     #[arg(long, value_name = "FILE")]
@@ -415,7 +419,7 @@ pub struct PrintArgs {
     #[arg(long)]
     pub env: Option<WorldName>,
     /// Print the annotated default instead: every option with its text, default and range.
-    #[arg(long, conflicts_with_all = ["config", "env", "settings", "scenes"])]
+    #[arg(long, conflicts_with_all = ["config", "env", "settings", "scenes", "files"])]
     pub default: bool,
     /// Options set on the command line.
     #[command(flatten)]

@@ -63,6 +63,8 @@ pub trait Solvable: World {
 
 impl Solvable for LavaGrid {}
 
+impl Solvable for lava_envs::Table {}
+
 impl Solvable for LavaPoint {
     fn yardstick(
         constants: &PointConfig,

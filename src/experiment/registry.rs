@@ -60,10 +60,10 @@ pub fn standard() -> &'static Registry {
     use crate::learn::methods::{
         Augmented, CvarPg, Game, Iqn, Neutral, Rarl, ReturnCapping, Uniform,
     };
-    use lava_envs::{LavaGrid, LavaPoint};
+    use lava_envs::{LavaGrid, LavaPoint, Table};
     static STANDARD: LazyLock<Registry> = LazyLock::new(|| {
         crate::registry! {
-            worlds: LavaGrid, LavaPoint;
+            worlds: LavaGrid, LavaPoint, Table;
             methods: Game, Neutral, Augmented, ReturnCapping, CvarPg, Rarl, Iqn, Uniform
         }
     });

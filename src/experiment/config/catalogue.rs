@@ -26,6 +26,10 @@ pub struct WorldInfo {
     pub training: &'static str,
     /// Checks constants and returns them in the order of their type, with defaults for absent ones.
     pub check: fn(Table) -> Result<Table, String>,
+    /// [`World::IN_BENCHMARK`].
+    pub in_benchmark: bool,
+    /// [`World::of_model`].
+    pub of_model: fn(&str) -> Result<Table, String>,
     /// [`World::of_map`].
     pub of_map: fn(&Map) -> Result<Table, String>,
     /// For each method, what refuses options with which it cannot train here.
@@ -50,6 +54,8 @@ impl WorldInfo {
             name: W::NAME,
             defaults: W::DEFAULTS,
             training: W::TRAINING,
+            in_benchmark: W::IN_BENCHMARK,
+            of_model: W::of_model,
             of_map: W::of_map,
             check: |table| {
                 let constants = constants_of::<W>(table)?;
@@ -109,6 +115,8 @@ impl Catalogue {
             words.map(|word| format!("{word:?}")).collect::<Vec<_>>().join(", ")
         };
         let names: Vec<&str> = worlds.iter().map(|of| of.name).collect();
+        let usual: Vec<&str> =
+            worlds.iter().filter(|of| of.in_benchmark).map(|of| of.name).collect();
         let with_scenes = names.iter().map(|name| format!("{name}/SCENE"));
         let listed_worlds: Vec<String> = names
             .iter()
@@ -119,7 +127,7 @@ impl Catalogue {
         let listed_worlds = listed_worlds.join(", ");
         let first: Vec<&str> = methods.iter().map(|of| of.name).take(1).collect();
         let mut annotated = GENERAL
-            .replace("envs = [\"lava-grid\", \"lava-point\"]", &format!("envs = {names:?}"))
+            .replace("envs = [\"lava-grid\", \"lava-point\"]", &format!("envs = {usual:?}"))
             .replace("methods = [\"game\"]", &format!("methods = {first:?}"))
             .replace("the worlds of the program", &listed_worlds)
             .replace("the methods of the program", &words(&mut methods.iter().map(|of| of.name)))

@@ -62,6 +62,7 @@ const EMBEDDED: &[(&str, &str)] = &[
     ("configs/methods.toml", include_str!("../../../configs/methods.toml")),
     ("configs/iqn.toml", include_str!("../../../configs/iqn.toml")),
     ("configs/suite.toml", include_str!("../../../configs/suite.toml")),
+    ("configs/frozen-lake.toml", include_str!("../../../configs/frozen-lake.toml")),
     ("configs/noise.toml", include_str!("../../../configs/noise.toml")),
 ];
 

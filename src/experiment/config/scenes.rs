@@ -13,6 +13,8 @@
 //! acceleration = 3.0
 //! ```
 //!
+//! A scene of the world `table` is a CSV file, its transitions ([`lava_envs::table`]).
+//!
 //! Each world lays itself out as the map ([`lava_envs::World::of_map`]): cells of the grid, or an arena whose lava, walls
 //! and goals are those cells in metres.
 
@@ -206,6 +208,15 @@ pub(super) fn place(
             if is_file {
                 let text = read_text(path)
                     .map_err(|source| ConfigError::Read { path: path.to_owned(), source })?;
+                if path.extension().is_some_and(|ending| ending.eq_ignore_ascii_case("csv")) {
+                    let constants = (catalogue.world(world)?.of_model)(&text).map_err(|why| {
+                        let message = format!("{world} cannot be played here: {why}");
+                        ConfigError::Syntax { origin: scene.clone(), message }
+                    })?;
+                    sections.insert(on.to_string(), constants.into());
+                    placed.push(on);
+                    continue;
+                }
                 let of_file = Scene::parse(scene, &text)?;
                 of_file.check(catalogue)?;
                 let (map, mut constants) = of_file.constants(catalogue.world(world)?)?;
