@@ -759,6 +759,7 @@ fn committed_results_make_their_tables_again() {
         "ablations",
         "methods",
         "suite",
+        "frozen-lake",
     ]) {
         let dir = tempfile::tempdir().unwrap();
         let (from, to) = (results.join(sweep), dir.path().join(sweep));

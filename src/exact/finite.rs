@@ -175,21 +175,21 @@ impl<W: World> ExactWorld<W> {
     }
 
     /// Expected visits of each state, ends included, when every action is carried out as it was
-    /// chosen. `None` where the world has actions that no outcome carries out.
+    /// chosen; under nominal chance where the world has actions that no outcome carries out.
     ///
     /// # Errors
     /// If the world is too large.
-    pub fn occupancy_as_intended(&self, policy: &Policy) -> Result<Option<Vec<f64>>, ExactError> {
+    pub fn occupancy(&self, policy: &Policy) -> Result<Vec<f64>, ExactError> {
         let model = self.model();
         let intended: Option<Vec<usize>> =
             (0..model.actions()).map(|action| model.intended_outcome(action)).collect();
-        let Some(intended) = intended else { return Ok(None) };
+        let Some(intended) = intended else { return Ok(evaluate(&self.mdp, policy).visits) };
         let steady = build(model, self.world.horizon(), self.mdp.gamma(), |_, action| {
             let mut law = vec![0.0; model.outcomes()];
             law[intended[action]] = 1.0;
             law
         })?;
-        Ok(Some(evaluate(&steady, policy).visits))
+        Ok(evaluate(&steady, policy).visits)
     }
 
     /// Solves everything at one budget.

@@ -323,11 +323,11 @@ pub trait ExactYardstick: Send + Sync {
     fn changes(&self, eta: f64, policy: &TablePolicy) -> Result<Changes, ExactError>;
 
     /// Expected visits of each state by the greedy policy, ends included, when every action is carried
-    /// out as it was chosen; `None` where the world has actions that no outcome carries out.
+    /// out as it was chosen; under nominal chance where the world has actions that no outcome carries out.
     ///
     /// # Errors
     /// If the policy does not fit the world.
-    fn occupancy_as_intended(&self, policy: &TablePolicy) -> Result<Option<Vec<f64>>, ExactError>;
+    fn occupancy(&self, policy: &TablePolicy) -> Result<Vec<f64>, ExactError>;
 
     /// What the policies that are optimal at some budgets attain: CVaR_alpha and mean, one point for
     /// each budget.
@@ -482,9 +482,9 @@ impl<W: World> ExactYardstick for Exact<W> {
         changes(&self.world, eta, self.optimum(eta)?.cvar, policy)
     }
 
-    fn occupancy_as_intended(&self, policy: &TablePolicy) -> Result<Option<Vec<f64>>, ExactError> {
+    fn occupancy(&self, policy: &TablePolicy) -> Result<Vec<f64>, ExactError> {
         let greedy = policy.on(&self.world)?.greedy(self.mdp());
-        self.world.occupancy_as_intended(&greedy)
+        self.world.occupancy(&greedy)
     }
 
     fn frontier(&self, etas: &[f64], alpha: f64) -> Result<Vec<[f64; 2]>, ExactError> {

@@ -276,6 +276,15 @@ def test_a_written_table_is_the_same_process(name: str, tmp_path: Path) -> None:
         assert again.optimum(alpha).cvar == pytest.approx(mdp.optimum(alpha).cvar, abs=1e-12)
 
 
+def test_the_lake_of_the_repository_is_that_of_gymnasium(tmp_path: Path) -> None:
+    committed = Path(__file__).parents[3] / "tests" / "data" / "frozen-lake-8x8.csv"
+    if not committed.exists():
+        pytest.skip("not in the repository")
+    FiniteMDP.from_env(toy("FrozenLake8x8"), 200).to_csv(tmp_path / "mdp.csv")
+    read = [np.loadtxt(path, delimiter=",", skiprows=1) for path in (committed, tmp_path / "mdp.csv")]
+    np.testing.assert_allclose(read[0], read[1], atol=1e-12)
+
+
 def test_a_table_with_several_starts_is_not_written(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="start in 2 states"):
         FiniteMDP([(0, 0, 1, 1.0, 1.0)], horizon=1, start=[0.5, 0.5]).to_csv(tmp_path / "mdp.csv")

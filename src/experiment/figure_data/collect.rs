@@ -107,7 +107,7 @@ fn cells<W: Arena + Solvable>(
     let exact = yardstick.as_ref().and_then(|yardstick| yardstick.exact());
     let (Some(exact), Some(policy)) = (exact, &policy) else { return Ok(data) };
     let rounded_all = |numbers: Vec<f64>| numbers.into_iter().map(rounded).collect();
-    data.occupancy = exact.occupancy_as_intended(policy)?.map(rounded_all).unwrap_or_default();
+    data.occupancy = rounded_all(exact.occupancy(policy)?);
     if data.learned.is_some() {
         let exposure = exact.exposure(of.run.eta.get(), policy)?;
         let episodes = of.run.evaluation.figure_episodes as f64;

@@ -287,7 +287,8 @@ pub(super) fn occupancy(scene: &Scene, panels: &[(usize, &Panel)]) -> Option<(Pi
         strip(canvas, &layout, "visits per episode", ["0".to_owned(), "1 and more".to_owned()])
     })?;
     let caption = "As in the paper's Figure 3: expected visits of the greedy protagonist in an episode in which \
-                   every chosen move is executed, averaged over seeds; exact. Empty cells: below 0.005.";
+                   every chosen move is executed (in any episode, where no outcome of chance does that), averaged over \
+                   seeds; exact. Empty cells: below 0.005.";
     Some((picture, caption.to_owned()))
 }
 
