@@ -200,7 +200,7 @@ impl Lines {
         let mut reader = csv::ReaderBuilder::new()
             .trim(csv::Trim::All)
             .flexible(true)
-            .from_reader(text[before..].as_bytes());
+            .from_reader(&text.as_bytes()[before..]);
         let header = reader.headers().map_err(|error| refused(1, error.to_string()))?.clone();
         let place = |name: &str| header.iter().position(|of| of.eq_ignore_ascii_case(name));
         let places = COLUMNS.map(place);

@@ -89,7 +89,8 @@ fn sentence(table: &Table, row: &Row) -> String {
     for (key, before, unit) in [
         ("mean", "mean return", ""),
         ("cvar", "CVaR at 1/eta", ""),
-        ("gain", "gain over eta = 1", ""),
+        ("gain_best_neutral", "gain over the best risk-neutral policy", ""),
+        ("gain", "gain over the learned eta = 1", ""),
         ("regret", "regret", ""),
         ("lava", "lava", " %"),
     ] {
