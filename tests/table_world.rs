@@ -40,16 +40,16 @@ fn the_default_table_is_the_counterexample() {
 /// Value iteration over the lines of the file, which knows nothing of worlds.
 #[test]
 fn the_optimum_at_eta_1_is_that_of_value_iteration() {
-    let mut transitions: BTreeMap<(usize, usize), Vec<(usize, f64, f64)>> = BTreeMap::new();
+    let mut transitions: BTreeMap<[usize; 2], Vec<(usize, f64, f64)>> = BTreeMap::new();
     for line in LAKE.lines().skip(1) {
         let fields: Vec<f64> = line.split(',').map(|field| field.parse().unwrap()).collect();
         let [from, action, to] = [0, 1, 2].map(|place| fields[place] as usize);
-        transitions.entry((from, action)).or_default().push((to, fields[3], fields[4]));
+        transitions.entry([from, action]).or_default().push((to, fields[3], fields[4]));
     }
     let mut value = [0.0; 70];
     for _ in 0..200 {
         let mut next = [f64::NEG_INFINITY; 70];
-        for ((from, _), outcomes) in &transitions {
+        for ([from, _], outcomes) in &transitions {
             let mean: f64 = outcomes.iter().map(|(to, p, reward)| p * (reward + value[*to])).sum();
             next[*from] = next[*from].max(mean);
         }

@@ -101,7 +101,7 @@ minibatch = 250
 entropy_final = 0.0
 "#;
 
-/// Constants of `table`; [`DEFAULTS`] explains them.
+/// Constants of `table`; [`Table::DEFAULTS`] explains them.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct TableConfig {
