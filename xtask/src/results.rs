@@ -318,7 +318,8 @@ fn members(repository: &Path, folder: &str, file: &str) -> Result<Vec<(PathBuf, 
     Ok(found)
 }
 
-fn crossings(repository: &Path, folder: &str, world: &str, eta: f64) -> Result<Vec<usize>> {
+/// A dash stands for a protagonist that does not get there.
+fn crossings(repository: &Path, folder: &str, world: &str, eta: f64) -> Result<Vec<String>> {
     let place = format!("{world}/game/eta-{eta}/");
     let mut rows = Vec::new();
     for (path, data) in members(repository, folder, "figure_data.json")? {
@@ -331,7 +332,9 @@ fn crossings(repository: &Path, folder: &str, world: &str, eta: f64) -> Result<V
         // The paper's map: ten columns, seven rows.
         ensure!(occupancy.len() == 70, "{} is of another map", path.display());
         let share = |row: &usize| occupancy[10 * row + 5].as_f64().unwrap_or_default();
-        rows.extend((0..7).max_by(|a, b| share(a).total_cmp(&share(b))));
+        let passed = (0..7).max_by(|a, b| share(a).total_cmp(&share(b)));
+        let passed = passed.filter(|row| share(row) >= 0.5);
+        rows.push(passed.map_or("–".to_owned(), |row| row.to_string()));
     }
     Ok(rows)
 }
