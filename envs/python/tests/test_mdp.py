@@ -287,7 +287,8 @@ def test_the_lake_of_the_repository_is_that_of_gymnasium(tmp_path: Path) -> None
 
 def test_a_table_with_several_starts_is_not_written(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="start in 2 states"):
-        FiniteMDP([(0, 0, 1, 1.0, 1.0)], horizon=1, start=[0.5, 0.5]).to_csv(tmp_path / "mdp.csv")
+        rows = [(0, 0, -1, 1.0, 1.0), (1, 0, -1, 1.0, 0.0)]
+        FiniteMDP(rows, horizon=1, start=[0.5, 0.5]).to_csv(tmp_path / "mdp.csv")
     assert not (tmp_path / "mdp.csv").exists()
 
 
