@@ -147,6 +147,10 @@ fn a_file_is_solved_trained_on_and_reported() {
     let place: PathBuf = folder.path().join("out/table+lake/game/eta-25/seed-1");
     assert!(place.join("evaluation.json").is_file());
     succeed(program(folder.path()).args(["report", "out"]));
+    for figure in ["occupancy", "deviations", "budget"] {
+        let path = folder.path().join(format!("out/figures/table+lake-{figure}.png"));
+        assert!(path.is_file(), "{figure}");
+    }
     let table = succeed(program(folder.path()).args(["table", "out"]));
     assert!(table.contains("table/lake"), "{table}");
     assert!(folder.path().join("out/report.html").is_file());

@@ -107,14 +107,19 @@ fn cells<W: Arena + Solvable>(
     let exact = yardstick.as_ref().and_then(|yardstick| yardstick.exact());
     let (Some(exact), Some(policy)) = (exact, &policy) else { return Ok(data) };
     let rounded_all = |numbers: Vec<f64>| numbers.into_iter().map(rounded).collect();
-    data.occupancy = rounded_all(exact.occupancy(policy)?);
+    // The last row of cells may have more cells than there are states.
+    let by_cell = |mut numbers: Vec<f64>| {
+        numbers.resize((scene.size[0] * scene.size[1]) as usize, 0.0);
+        numbers
+    };
+    data.occupancy = by_cell(rounded_all(exact.occupancy(policy)?));
     if data.learned.is_some() {
         let exposure = exact.exposure(of.run.eta.get(), policy)?;
         let episodes = of.run.evaluation.figure_episodes as f64;
         let expected = |numbers: &[f64]| numbers.iter().map(|n| rounded(n * episodes)).collect();
         data.exact = Some(Deviations {
-            visits: expected(&exposure.visits),
-            deviations: expected(&exposure.deviations),
+            visits: by_cell(expected(&exposure.visits)),
+            deviations: by_cell(expected(&exposure.deviations)),
         });
         data.exact_budget = rounded_all(exposure.budget);
         data.exact_budget.truncate(MOST_TIMES as usize);
