@@ -2,10 +2,9 @@
 //! `results/coverage.md`. Where the simulation changes, `COVERAGE=write cargo test --test coverage` writes it again.
 
 use cvar_game::report::statistics::{
-    Interval, clopper_pearson, difference, improvement_interval, iqm_estimate, mean_estimate,
-    overall, student_estimate, wilson,
+    Interval, clopper_pearson, difference, improvement, improvement_interval, iqm, iqm_estimate,
+    mean_estimate, overall, student_estimate, wilson,
 };
-use cvar_game::report::statistics::{improvement, iqm};
 use lava_envs::random::{ChaCha8Rng, Purpose, stream};
 use rand::RngExt as _;
 use rand_distr::{Distribution as _, Exp1, StandardNormal};

@@ -15,8 +15,8 @@
 //! runs but the range of returns, and is as wide as that makes it.
 //!
 //! Evaluations of all runs share their random streams, and a regret to a sampled optimum shares that optimum: this part
-//! of their error does not show in the spread between seeds. Every interval adds the whole sampling error of a run, as
-//! if all of it were shared; where laws are exact there is none.
+//! of their error does not show in the spread between seeds. Intervals of means add the whole sampling error of a run, as
+//! if all of it were shared; where laws are exact there is none. In paired differences it cancels.
 //!
 //! What each interval covers, with and without failures, was simulated: `results/coverage.md`, made by
 //! `tests/coverage.rs`. IQM and probability of improvement follow Agarwal et al., "Deep Reinforcement Learning at the
@@ -149,7 +149,10 @@ pub fn student_estimate(values: &[f64]) -> Option<Estimate> {
     Some(Estimate { value, interval })
 }
 
-/// How far the ends of Hall's interval are below and above the mean; `None` where values do not differ.
+/// Skewness below which values count as symmetric: there the transformation is the identity, up to its rounding.
+const SYMMETRIC: f64 = 1e-6;
+
+/// How far the ends of Hall's interval are below and above the mean; `None` where values do not differ or are symmetric.
 fn skewed_deviations(values: &[f64]) -> Option<[f64; 2]> {
     let (centre, count) = (mean(values)?, values.len() as f64);
     let moment = |power| values.iter().map(|of| (of - centre).powi(power)).sum::<f64>() / count;
@@ -161,8 +164,9 @@ fn skewed_deviations(values: &[f64]) -> Option<[f64; 2]> {
         let root = (1.0 + skewness * (of - skewness / (6.0 * count))).cbrt();
         3.0 / skewness * (root - 1.0)
     };
-    let found = [deviation * inverse(quantile), -deviation * inverse(-quantile)];
-    found.iter().all(|of| of.is_finite()).then_some(found)
+    // Values that do not differ have a skewness that is no number.
+    (skewness.abs() > SYMMETRIC)
+        .then(|| [deviation * inverse(quantile), -deviation * inverse(-quantile)])
 }
 
 /// Interquartile mean ([`iqm`]) with the t interval of a trimmed mean (Yuen 1974), whose error is that of the winsorised

@@ -238,7 +238,7 @@ pub static COLUMNS: [Column; 45] = [
         format: Format::Percent,
         best: Best::None,
         meaning: "share of the seeds that fail: the run stopped, or its greedy protagonist reaches the goal in fewer than \
-                  half of its episodes (and the best policy that is known does not). Where a seed fails and others do \
+                  half of its episodes, though the best policy that is known reaches it. Where a seed fails and others do \
                   not, the columns that do not say otherwise are of the others",
         brief: "seeds that do not reach the goal; the other columns are mostly of the others",
         compute: |group, _| estimate(group.failure_rate()),
