@@ -12,7 +12,7 @@ use cvar_game::learn::device::Device;
 use cvar_game::learn::head::{
     AntagonistHead, Block, CategoricalPolicy, GaussianPolicy, Head, PolicyHead,
 };
-use cvar_game::learn::inputs::{Columns, Inputs, Selection};
+use cvar_game::learn::inputs::{Columns, Distinct, Inputs, Selection};
 use cvar_game::learn::method::{Arena, Players, Progress, Setting, TrainError, Training};
 use cvar_game::learn::methods::game::GameTraining;
 use cvar_game::learn::network::{Network, Outputs, Shape};
@@ -332,6 +332,52 @@ fn a_cell_is_its_one_hot_code() {
         for (ours, theirs) in ours.iter().zip(&theirs) {
             assert!((ours - theirs).abs() < 1e-5 * (1.0 + theirs.abs()), "{ours}, {theirs}");
         }
+    }
+}
+
+/// A minibatch in which samples repeat has the gradient of one that has each of them by itself.
+#[test]
+fn samples_that_repeat_have_the_gradient_of_each() {
+    let columns = Columns { cells: 9, numbers: 2, critic_only: 1 };
+    let shape = Shape { columns, hidden: 16, outputs: 3, constants: 0 };
+    let mut random = ChaCha8Rng::seed_from_u64(5);
+    let mut network = Network::new(shape, &[], Device::Cpu, &mut random);
+    // 9 cells at 10 times, 700 samples: more different ones than fit into a block, and a last block that is not full.
+    let mut batch = Inputs::default();
+    for _ in 0..700 {
+        batch.cells.push(random.random_range(0..9));
+        let time = random.random_range(0..10) as f32;
+        batch.numbers.extend([time / 10.0, time / 7.0, 1.0]);
+    }
+    let width = shape.width();
+    assert!(Distinct::within(batch.rows(), width, 60).is_none());
+    let Distinct { inputs, of } = Distinct::within(batch.rows(), width, 90).unwrap();
+    let mut again = Inputs::default();
+    for &place in &of {
+        again.cells.push(inputs.cells[place]);
+        again.numbers.extend(&inputs.numbers[place * width..][..width]);
+    }
+    assert_eq!(again, batch);
+
+    let order: Vec<usize> = (0..700).filter(|i| i % 7 != 2).collect();
+    let places: Vec<usize> = order.iter().map(|&i| of[i]).collect();
+    let mut run = |all: &Inputs, indices: &[usize]| {
+        let mut gradient = Vec::new();
+        network.differentiate(Selection { all: all.rows(), indices }, &mut gradient, |block| {
+            let Outputs { start, samples, y, stride } = block;
+            for row in y.chunks_mut(stride) {
+                for (i, y) in row[..samples].iter_mut().enumerate() {
+                    *y *= ((start + i) % 5) as f32 - 1.5;
+                }
+            }
+        });
+        gradient
+    };
+    let each = run(&batch, &order);
+    let together = run(&inputs, &places);
+    assert!(each.iter().any(|by| by.abs() > 1.0));
+    for (ours, theirs) in together.iter().zip(&each) {
+        assert!((ours - theirs).abs() < 1e-4 * (1.0 + theirs.abs()), "{ours}, {theirs}");
     }
 }
 

@@ -1,6 +1,8 @@
 //! What a batch of samples shows to a network.
 
+use pulp::bytemuck;
 use serde::{Deserialize, Serialize};
+use std::collections::HashMap;
 
 /// Sizes of a sample.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -52,13 +54,44 @@ impl Inputs {
     }
 }
 
-/// Some samples of a batch.
+/// Some samples of a batch, in any order and any number of times.
 #[derive(Debug, Clone, Copy)]
 pub struct Selection<'a> {
     /// The batch.
     pub all: Rows<'a>,
     /// Indices of the samples.
     pub indices: &'a [usize],
+}
+
+/// The different samples of a batch: a player that sees no more than its cell sees the same few again and again.
+#[derive(Debug, Default)]
+pub struct Distinct {
+    /// Each of them once.
+    pub inputs: Inputs,
+    /// Which of them each sample of the batch is.
+    pub of: Vec<usize>,
+}
+
+impl Distinct {
+    /// The different samples of a batch, unless there are more than `most`; `width` is the length of a sample's
+    /// numbers.
+    pub fn within(batch: Rows<'_>, width: usize, most: usize) -> Option<Distinct> {
+        let mut distinct = Distinct::default();
+        let mut places = HashMap::new();
+        for sample in batch.blocks(1, width) {
+            let bits: &[u32] = bytemuck::cast_slice(sample.numbers);
+            let next = places.len();
+            let place = *places.entry((sample.cells, bits)).or_insert(next);
+            if place == most {
+                return None;
+            }
+            if place == next {
+                distinct.inputs.extend(sample);
+            }
+            distinct.of.push(place);
+        }
+        Some(distinct)
+    }
 }
 
 impl<'a> Rows<'a> {

@@ -16,7 +16,7 @@ use crate::learn::budget_sensitivity::BudgetSensitivity;
 use crate::learn::device::Device;
 use crate::learn::gae::{self, Estimates};
 use crate::learn::head::{Block, Head};
-use crate::learn::inputs::{Columns, Selection};
+use crate::learn::inputs::{Columns, Distinct, Selection};
 use crate::learn::network::{Network, Outputs, Shape};
 use crate::learn::options::PlayerOptions;
 use crate::learn::state::{PlayerState, Unfit};
@@ -273,7 +273,18 @@ impl<H: Head> Player<H> {
         random: &mut ChaCha8Rng,
     ) -> Losses {
         let Workspace { values, advantages, samples, order, gradient } = &mut self.workspace;
-        self.network.values(trajectories.inputs.rows(), values);
+        let width = self.network.shape().width();
+        let batch = trajectories.inputs.rows();
+        let distinct = Distinct::within(batch, width, options.minibatch / 2);
+        match &distinct {
+            Some(Distinct { inputs, of }) => {
+                let mut each = Vec::new();
+                self.network.values(inputs.rows(), &mut each);
+                values.clear();
+                values.extend(of.iter().map(|&place| each[place]));
+            }
+            None => self.network.values(batch, values),
+        }
         gae::advantages(
             &trajectories.rewards,
             &trajectories.ended,
@@ -319,7 +330,14 @@ impl<H: Head> Player<H> {
                 if !centred {
                     loss = loss.uncentred();
                 }
-                let inputs = Selection { all: trajectories.inputs.rows(), indices };
+                let places: Vec<usize>;
+                let inputs = match &distinct {
+                    Some(Distinct { inputs, of }) => {
+                        places = indices.iter().map(|&i| of[i]).collect();
+                        Selection { all: inputs.rows(), indices: &places }
+                    }
+                    None => Selection { all: batch, indices },
+                };
                 self.network.differentiate(inputs, gradient, |block| loss.add(block));
                 let at = gradient.len() - constants.len();
                 let mut step = loss.finish(&mut gradient[at..]);

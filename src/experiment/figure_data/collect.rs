@@ -8,7 +8,6 @@ use crate::exact::yardstick::Solvable;
 use crate::experiment::artefacts::{Chance, SCHEMA};
 use crate::experiment::evaluation::Contestants;
 use crate::experiment::failure::RunError;
-use crate::game::columns::ln;
 use crate::game::returns::ReturnSoFar;
 use crate::learn::method::Arena;
 use crate::learn::play::Watcher;
@@ -214,7 +213,7 @@ impl Counts {
                 map.visits[bin] += 1;
                 map.shift[bin][0] += dx;
                 map.shift[bin][1] += dy;
-                map.divergence[bin] += ln(step.ratio);
+                map.divergence[bin] += step.ratio.max(f64::MIN_POSITIVE).ln();
             }
         }
     }
@@ -339,7 +338,7 @@ impl<W: World> Watcher<W> for Collector {
             ratio: game.ratios[slot],
         };
         let before = game.budgets_before[slot].get();
-        let left = (ln(before) * self.scale).min(MOST_LEFT);
+        let left = (before.ln() * self.scale).min(MOST_LEFT);
         if self.chance == Chance::Antagonist {
             self.budgets.add(time, left);
         }

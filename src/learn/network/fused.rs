@@ -32,6 +32,7 @@ pub struct Fused {
     x: Aligned,
     h: Aligned,
     y: Aligned,
+    of_sample: Aligned,
     /// Gradients of W' and of V, a partial sum per lane.
     by_first: Aligned,
     by_second: Aligned,
@@ -384,43 +385,53 @@ impl<L: FnMut(Outputs<'_>)> WithSimd for Differentiate<'_, L> {
     fn with_simd<S: Simd>(self, simd: S) {
         let Differentiate { shape, parameters, inputs, gradient, mut loss, buffers } = self;
         let (width, hidden, units) = (shape.width(), shape.hidden, 2 * shape.hidden);
-        let Fused { x, h, y, by_first, by_second } = buffers;
-        let x = x.slice(width * SAMPLES);
-        let h = h.slice(units * SAMPLES);
-        let y = y.slice(shape.rows() * SAMPLES);
+        let Selection { all, indices } = inputs;
+        let samples = all.numbers.len() / width;
+        // Where samples repeat, one pass over the batch serves them all.
+        let repeated = 2 * samples <= indices.len();
+        let blocks = if repeated { samples.div_ceil(SAMPLES) } else { 1 };
+        let Fused { x, h, y, of_sample, by_first, by_second } = buffers;
+        let x = x.slice(blocks * width * SAMPLES);
+        let h = h.slice(blocks * units * SAMPLES);
+        let y = y.slice(blocks * shape.rows() * SAMPLES);
         let by_first = by_first.slice(units * width * S::F32_LANES);
         let by_second = by_second.slice(shape.rows() * hidden * S::F32_LANES);
         by_first.fill(0.0);
         by_second.fill(0.0);
         gradient.fill(0.0);
-        let Selection { all, indices } = inputs;
-        let mut cells = Vec::new();
-        for (block, indices) in indices.chunks(SAMPLES).enumerate() {
-            let samples = indices.len();
-            load(indices.iter().map(|&i| &all.numbers[i * width..][..width]), x);
-            if shape.columns.cells > 0 {
-                cells.clear();
-                cells.extend(indices.iter().map(|&i| all.cells[i]));
+        let mut pass = Pass { simd, shape, parameters, gradient, by_first, by_second };
+        if repeated {
+            let x = x.chunks_exact_mut(width * SAMPLES);
+            let h = h.chunks_exact_mut(units * SAMPLES);
+            let mut y: Vec<_> = y.chunks_exact_mut(shape.rows() * SAMPLES).collect();
+            let mut blocks: Vec<_> = x.zip(h).zip(all.blocks(SAMPLES, width)).collect();
+            for (((x, h), inputs), y) in blocks.iter_mut().zip(&mut y) {
+                load(inputs.numbers.chunks_exact(width), x);
+                pass.forward(inputs.cells, x, h, y);
             }
-            hidden_layer(simd, shape, parameters, 0, &cells, x, h);
-            let (actor, critic) = h.split_at(hidden * SAMPLES);
-            let (action, value) = y.split_at_mut(shape.outputs * SAMPLES);
-            output_rows(simd, shape, parameters, 0..shape.outputs, actor, action);
-            output_rows(simd, shape, parameters, shape.outputs..shape.rows(), critic, value);
-            loss(Outputs { start: block * SAMPLES, samples, y: &mut y[..], stride: SAMPLES });
-            for (row, y) in y.chunks_exact_mut(SAMPLES).enumerate() {
-                y[samples..].fill(0.0);
-                gradient[shape.bias_at() + row] += y.iter().sum::<f32>();
+            let of_sample = of_sample.slice(shape.rows() * SAMPLES);
+            loss_of_repeated(indices, &mut y, of_sample, &mut loss);
+            for (((x, h), inputs), y) in blocks.iter_mut().zip(&y) {
+                pass.backward(inputs.cells, x, h, y);
             }
-            backward(simd, shape, parameters, [x, y], h, by_first, by_second);
-            // The gradient by the column of W that a cell selects is that by z.
-            for (sample, &cell) in cells.iter().enumerate() {
-                let column = &mut gradient[shape.first_at(0, cell as usize)..][..units];
-                for (sum, by_z) in column.iter_mut().zip(h.chunks_exact(SAMPLES)) {
-                    *sum += by_z[sample];
+        } else {
+            let mut cells = Vec::new();
+            for (block, indices) in indices.chunks(SAMPLES).enumerate() {
+                let samples = indices.len();
+                load(indices.iter().map(|&i| &all.numbers[i * width..][..width]), x);
+                if shape.columns.cells > 0 {
+                    cells.clear();
+                    cells.extend(indices.iter().map(|&i| all.cells[i]));
                 }
+                pass.forward(&cells, x, h, y);
+                loss(Outputs { start: block * SAMPLES, samples, y: &mut y[..], stride: SAMPLES });
+                for y in y.chunks_exact_mut(SAMPLES) {
+                    y[samples..].fill(0.0);
+                }
+                pass.backward(&cells, x, h, y);
             }
         }
+        let Pass { by_first, by_second, gradient, .. } = pass;
         let (by_first, by_second) = (S::as_simd_f32s(by_first).0, S::as_simd_f32s(by_second).0);
         for unit in 0..units {
             for input in 0..width {
@@ -437,33 +448,94 @@ impl<L: FnMut(Outputs<'_>)> WithSimd for Differentiate<'_, L> {
     }
 }
 
-/// Adds a block's gradient by V and by the columns of W for x, given x, dL/dy and h, and turns h into
-/// dL/dz, z = W x.
-#[inline(always)]
-fn backward<S: Simd>(
+/// The loss of samples that repeat, by the outputs of the batch: `y` has the rows of `SAMPLES` of its samples each, and
+/// becomes the gradient by them.
+fn loss_of_repeated(
+    indices: &[usize],
+    y: &mut [&mut [f32]],
+    of_sample: &mut [f32],
+    loss: &mut impl FnMut(Outputs<'_>),
+) {
+    let mut by_y: Vec<Vec<f32>> = y.iter().map(|y| vec![0.0; y.len()]).collect();
+    for (block, indices) in indices.chunks(SAMPLES).enumerate() {
+        for (sample, &index) in indices.iter().enumerate() {
+            let rows = y[index / SAMPLES].chunks_exact(SAMPLES);
+            for (of, row) in of_sample.chunks_exact_mut(SAMPLES).zip(rows) {
+                of[sample] = row[index % SAMPLES];
+            }
+        }
+        let (start, samples) = (block * SAMPLES, indices.len());
+        loss(Outputs { start, samples, y: of_sample, stride: SAMPLES });
+        for (sample, &index) in indices.iter().enumerate() {
+            let rows = by_y[index / SAMPLES].chunks_exact_mut(SAMPLES);
+            for (of, row) in of_sample.chunks_exact(SAMPLES).zip(rows) {
+                row[index % SAMPLES] += of[sample];
+            }
+        }
+    }
+    for (y, by_y) in y.iter_mut().zip(by_y) {
+        y.copy_from_slice(&by_y);
+    }
+}
+
+/// The passes of a block and what its gradients are added to.
+struct Pass<'a, S> {
     simd: S,
     shape: Shape,
-    parameters: &[f32],
-    [x, y]: [&[f32]; 2],
-    h: &mut [f32],
-    by_first: &mut [f32],
-    by_second: &mut [f32],
-) {
-    let (x, y) = (S::as_simd_f32s(x).0, S::as_simd_f32s(y).0);
-    let h = S::as_mut_simd_f32s(h).0;
-    let (by_first, by_second) = (S::as_mut_simd_f32s(by_first).0, S::as_mut_simd_f32s(by_second).0);
-    let vectors = SAMPLES / S::F32_LANES;
-    let (k, hidden) = (shape.outputs, shape.hidden);
-    let (actor, critic) = h.split_at_mut(hidden * vectors);
-    let (by_action, by_value) = y.split_at(k * vectors);
-    let (to_action, to_value) = by_second.split_at_mut(k * hidden);
-    for (row, h, y, sums) in [(0, actor, by_action, to_action), (k, critic, by_value, to_value)] {
-        correlate(simd, y, h, sums);
-        let at = shape.second_at(row, shape.half(row).start);
-        let weights = Weights { all: parameters, at, of_row: 1, of_term: 2 * hidden };
-        combine(simd, weights, y, h, Finish::TimesSlope);
+    parameters: &'a [f32],
+    gradient: &'a mut [f32],
+    by_first: &'a mut [f32],
+    by_second: &'a mut [f32],
+}
+
+impl<S: Simd> Pass<'_, S> {
+    /// h and y of a block, given x.
+    #[inline(always)]
+    fn forward(&self, cells: &[u32], x: &[f32], h: &mut [f32], y: &mut [f32]) {
+        let Pass { simd, shape, parameters, .. } = *self;
+        hidden_layer(simd, shape, parameters, 0, cells, x, h);
+        let (actor, critic) = h.split_at(shape.hidden * SAMPLES);
+        let (action, value) = y.split_at_mut(shape.outputs * SAMPLES);
+        output_rows(simd, shape, parameters, 0..shape.outputs, actor, action);
+        output_rows(simd, shape, parameters, shape.outputs..shape.rows(), critic, value);
     }
-    correlate(simd, h, x, by_first);
+
+    /// Adds a block's gradient by W, V and b, given x, dL/dy and h, and turns h into dL/dz, z = W x.
+    #[inline(always)]
+    fn backward(&mut self, cells: &[u32], x: &[f32], h: &mut [f32], y: &[f32]) {
+        let Pass { simd, shape, parameters, .. } = *self;
+        let units = 2 * shape.hidden;
+        for (row, y) in y.chunks_exact(SAMPLES).enumerate() {
+            self.gradient[shape.bias_at() + row] += y.iter().sum::<f32>();
+        }
+        {
+            let (x, y) = (S::as_simd_f32s(x).0, S::as_simd_f32s(y).0);
+            let h = S::as_mut_simd_f32s(h).0;
+            let by_first = S::as_mut_simd_f32s(self.by_first).0;
+            let by_second = S::as_mut_simd_f32s(self.by_second).0;
+            let vectors = SAMPLES / S::F32_LANES;
+            let (k, hidden) = (shape.outputs, shape.hidden);
+            let (actor, critic) = h.split_at_mut(hidden * vectors);
+            let (by_action, by_value) = y.split_at(k * vectors);
+            let (to_action, to_value) = by_second.split_at_mut(k * hidden);
+            for (row, h, y, sums) in
+                [(0, actor, by_action, to_action), (k, critic, by_value, to_value)]
+            {
+                correlate(simd, y, h, sums);
+                let at = shape.second_at(row, shape.half(row).start);
+                let weights = Weights { all: parameters, at, of_row: 1, of_term: units };
+                combine(simd, weights, y, h, Finish::TimesSlope);
+            }
+            correlate(simd, h, x, by_first);
+        }
+        // The gradient by the column of W that a cell selects is that by z.
+        for (sample, &cell) in cells.iter().enumerate() {
+            let column = &mut self.gradient[shape.first_at(0, cell as usize)..][..units];
+            for (sum, by_z) in column.iter_mut().zip(h.chunks_exact(SAMPLES)) {
+                *sum += by_z[sample];
+            }
+        }
+    }
 }
 
 #[cfg(test)]
