@@ -518,44 +518,82 @@ fn exploring_starts_fade_out_and_are_not_reported() {
     assert!(collector.finished.iter().all(|episode| episode.steps <= 40));
 }
 
-/// 10,000 trajectories against antagonists with large random weights: the budget holds on each.
-fn check_budget<W: Arena>(world: impl Fn() -> W) {
-    for (budget, episodes) in [(1.5, 2_000), (25.0, 4_000), (100.0, 4_000)] {
+/// Plays episodes against an antagonist with large random weights, checks the budget on each, and returns their steps.
+fn check_budget<W: Arena>(
+    world: W,
+    options: &TrainOptions,
+    (budget, strength): (f64, f32),
+    episodes: u64,
+    seed: u64,
+) -> u64 {
+    let mut pair = fresh_pair::<W>(options, budget, seed);
+    pair.antagonist.as_mut().unwrap().network_mut().change(|weights| {
+        let mut random = ChaCha8Rng::seed_from_u64(seed);
+        for weight in weights {
+            *weight = strength * (*weight + random.random_range(-0.1f32..0.1));
+        }
+    });
+    let (mode, draw, eta) = (Mode::Sampled, Draw::Perturbed, eta(budget));
+    let setting = Play { mode, draw, eta, gamma: 1.0, episodes, seed };
+    let played = played(world, &pair, Some(Draw::Perturbed), &setting);
+    for episode in &played.episodes {
+        let used = episode.likelihood_ratio / budget;
+        assert!(
+            used <= 1.0 + 1e-6,
+            "seed {seed}: prod delta / eta = {used} at strength {strength}, eta {budget}"
+        );
+    }
+    assert!(played.normalisation_error <= 1e-6, "seed {seed}: {}", played.normalisation_error);
+    assert_eq!(played.episodes.len() as u64, episodes);
+    played.episodes.iter().map(|episode| u64::from(episode.atom.steps)).sum()
+}
+
+/// 10,000 trajectories: the budget holds on each.
+fn check_budgets<W: Arena>(world: impl Fn() -> W) {
+    for (budget, episodes) in [(1.5, 500), (25.0, 1_000), (100.0, 1_000)] {
         for (seed, strength) in [(1, 1.0f32), (2, 6.0), (3, 40.0), (4, 200.0)] {
-            let mut pair = fresh_pair::<W>(&options(), budget, seed);
-            pair.antagonist.as_mut().unwrap().network_mut().change(|weights| {
-                let mut random = ChaCha8Rng::seed_from_u64(seed);
-                for weight in weights {
-                    *weight = strength * (*weight + random.random_range(-0.1f32..0.1));
-                }
-            });
-            let setting = Play {
-                mode: Mode::Sampled,
-                draw: Draw::Perturbed,
-                eta: eta(budget),
-                gamma: 1.0,
-                episodes: episodes / 4,
-                seed,
-            };
-            let played = played(world(), &pair, Some(Draw::Perturbed), &setting);
-            for episode in &played.episodes {
-                let used = episode.likelihood_ratio / budget;
-                assert!(used <= 1.0 + 1e-6, "prod delta / eta = {used} at strength {strength}");
-            }
-            assert!(played.normalisation_error <= 1e-6, "{}", played.normalisation_error);
-            assert_eq!(played.episodes.len() as u64, episodes / 4);
+            check_budget(world(), &options(), (budget, strength), episodes, seed);
         }
     }
 }
 
+/// Half a billion steps against antagonists of random strength, budgets of 1.01 to a million and sums of one to three
+/// components.
+fn check_budgets_for_long<W: Arena>(world: impl Fn() -> W) {
+    let (mut steps, mut seed) = (0, 0);
+    while steps < 500_000_000 {
+        seed += 1;
+        let mut random = ChaCha8Rng::seed_from_u64(seed);
+        let budget = 10f64.powf(random.random_range(0.005..6.0));
+        let strength = 10f32.powf(random.random_range(-1.0..3.0));
+        let mut options = options();
+        options.family.count = random.random_range(1..=3);
+        options.antagonist.time_aware = random.random();
+        steps += check_budget(world(), &options, (budget, strength), 20_000, seed);
+    }
+    println!("{steps} steps, {seed} antagonists");
+}
+
+#[test]
+#[ignore = "ten minutes: half a billion steps on each world, in release"]
+fn no_antagonist_breaks_the_budget_on_the_grid_for_long() {
+    check_budgets_for_long(|| LavaGrid::new(&GridConfig::default(), 250).unwrap());
+}
+
+#[test]
+#[ignore = "ten minutes: half a billion steps on each world, in release"]
+fn no_antagonist_breaks_the_budget_at_the_point_mass_for_long() {
+    check_budgets_for_long(|| LavaPoint::new(&PointConfig::default(), 250).unwrap());
+}
+
 #[test]
 fn no_antagonist_breaks_the_budget_on_the_grid() {
-    check_budget(|| LavaGrid::new(&GridConfig::default(), 250).unwrap());
+    check_budgets(|| LavaGrid::new(&GridConfig::default(), 250).unwrap());
 }
 
 #[test]
 fn no_antagonist_breaks_the_budget_at_the_point_mass() {
-    check_budget(|| LavaPoint::new(&PointConfig::default(), 250).unwrap());
+    check_budgets(|| LavaPoint::new(&PointConfig::default(), 250).unwrap());
 }
 
 /// Nominal episodes weighted by prod delta against episodes of the antagonist itself.
