@@ -11,6 +11,7 @@ use super::{Outputs, Shape};
 use crate::game::columns::SAMPLES;
 use crate::learn::inputs::{Rows, Selection};
 use pulp::{Arch, Simd, WithSimd};
+use std::hint::black_box;
 
 /// Numbers that begin at a multiple of 64 bytes: a vector load then stays within one cache line.
 #[derive(Debug, Default)]
@@ -75,6 +76,13 @@ fn load<'a>(samples: impl ExactSizeIterator<Item = &'a [f32]>, x: &mut [f32]) {
             row[sample] = number;
         }
     }
+}
+
+/// Brings samples from anywhere in a batch into the nearest cache. Read one right after the other their lines arrive
+/// together; in [`load`] the processor would wait for each.
+fn touch(indices: &[usize], numbers: &[f32], width: usize) {
+    let ends = indices.iter().map(|&i| numbers[i * width] + numbers[(i + 1) * width - 1]);
+    black_box(ends.sum::<f32>());
 }
 
 /// Vectors of a tile.
@@ -418,6 +426,7 @@ impl<L: FnMut(Outputs<'_>)> WithSimd for Differentiate<'_, L> {
             let mut cells = Vec::new();
             for (block, indices) in indices.chunks(SAMPLES).enumerate() {
                 let samples = indices.len();
+                touch(indices, all.numbers, width);
                 load(indices.iter().map(|&i| &all.numbers[i * width..][..width]), x);
                 if shape.columns.cells > 0 {
                     cells.clear();
