@@ -15,7 +15,7 @@ use crate::experiment::config::scenes;
 use crate::experiment::config::{Config, RunConfig, Setting, Shift, Source, WorldConstants};
 use crate::experiment::evaluation;
 use crate::experiment::failure::RunError;
-use crate::experiment::names::{MethodName, RunId, WorldName};
+use crate::experiment::names::{MethodName, RunId, WorldName, base_of};
 use crate::experiment::plan;
 use crate::experiment::registry::{Registry, Request};
 use crate::experiment::runner::{
@@ -335,7 +335,13 @@ fn exact(registry: &Registry, args: &ExactArgs) -> Result<ExitCode> {
     let found = registry.world(constants)?.solve(constants, gamma, eta, &options, &watched);
     watched.finish();
     let found = found?;
-    print(&if args.json { found.json() } else { found.to_string() })
+    if args.json {
+        return print(&found.json());
+    }
+    // The solver's page begins with the world and knows nothing of scenes.
+    let page = found.to_string();
+    let rest = page.strip_prefix(base_of(world.as_str()));
+    print(&rest.map_or_else(|| page.clone(), |rest| format!("{world}{rest}")))
 }
 
 fn table(registry: &Registry, args: &TableArgs) -> Result<ExitCode> {
@@ -485,9 +491,9 @@ fn judge_shifted(
             registry.world(&config.env).and_then(|of| of.greedy_law(&config, &folder, &request));
         law.map_err(|error| error.to_string())
     };
-    let all = report::shifts::count(dir, shifts, registry)? as u64;
-    let meter = Counter::new(Meter::new("policies", all));
-    let notes = report::shifts::write(dir, shifts, registry, &judge, &|| meter.count());
+    let shifted = report::shifts::Shifted::read(dir, shifts, registry)?;
+    let meter = Counter::new(Meter::new("policies", shifted.judgements() as u64));
+    let notes = shifted.write(registry, &judge, &|| meter.count());
     meter.finish();
     notes?.into_iter().for_each(note);
     note(format!("written to {}", dir.join("shifts.csv").display()));

@@ -10,7 +10,7 @@
 //!
 //! [`write_all`] adds `figures/` ([`figures`]) and `report.html` ([`page`]), and [`write_comparison`] puts
 //! several folders side by side. Methods and variants in one folder are compared in the same way.
-//! [`shifts::write`] judges the policies where the world is another than in training.
+//! [`shifts::Shifted`] judges the policies where the world is another than in training.
 //!
 //! Nothing is simulated here ([`shifts`] has its caller play) and nothing is random: the same artefacts give the same bytes. What a world looks like, and its exact optima, are asked from
 //! [`Worlds`].

@@ -38,67 +38,88 @@ impl Judged<'_> {
 /// The law of the return of a run's greedy protagonist under these constants, or why there is none.
 pub type Judge<'a> = dyn Fn(&Run, &toml::Table) -> Result<ReturnLaw, String> + 'a;
 
-/// Judges every run of a folder under every shift of its world; writes `shifts.csv` and the figures, and answers with
-/// what a reader must know. `judged` is called after each run and value.
-///
-/// # Errors
-/// If the folder cannot be read or written, or no run can be judged.
-pub fn write(
-    dir: &Path,
-    shifts: &[Shift],
-    worlds: &dyn Worlds,
-    judge: &Judge<'_>,
-    judged: &dyn Fn(),
-) -> Result<Vec<String>, ReportError> {
-    let runs = Runs::read(dir, worlds)?;
-    let mut notes = runs.notes.clone();
-    let (mut found, mut refused) = (Vec::new(), Vec::new());
-    for (run, shift, value) in work(&runs, shifts) {
-        let mut constants = run.settings.task.constants.clone();
-        constants.insert(shift.constant.clone(), toml::Value::Float(value));
-        match judge(run, &constants) {
-            Ok(law) => {
-                let (task, eta) = (&run.settings.task, run.name.eta);
-                let optimum = match worlds.optimum(&run.name.world, &constants, task.gamma, eta) {
-                    Optimum::Known(best) => Some(best.cvar(run.alpha())),
-                    _ => None,
-                };
-                found.push(Judged { run, constant: &shift.constant, value, law, optimum });
-            }
-            Err(why) => refused.push((&run.name, why)),
-        }
-        judged();
-    }
-    refused.dedup();
-    if found.is_empty() {
-        let none = || "it has no runs of these worlds".to_owned();
-        let what = refused.first().map_or_else(none, |(_, why)| why.clone());
-        return Err(ReportError::NotJudged { dir: dir.to_path_buf(), what });
-    }
-    notes.extend(refused.iter().map(|(run, why)| format!("LEFT OUT: {run}, {why}.")));
-    persist(&dir.join("shifts.csv"), to_csv(&found).as_bytes())?;
-    for figure in drawn(&found) {
-        persist_figure(dir, &figure)?;
-    }
-    Ok(notes)
-}
-
-/// Number of judgements that [`write()`] makes.
-///
-/// # Errors
-/// As [`write()`].
-pub fn count(dir: &Path, shifts: &[Shift], worlds: &dyn Worlds) -> Result<usize, ReportError> {
-    Ok(work(&Runs::read(dir, worlds)?, shifts).count())
-}
-
-fn work<'a>(
-    runs: &'a Runs,
+/// The runs of a folder, and the shifts under which they are to be judged.
+#[derive(Debug)]
+pub struct Shifted<'a> {
+    dir: &'a Path,
     shifts: &'a [Shift],
-) -> impl Iterator<Item = (&'a Run, &'a Shift, f64)> {
-    runs.runs.iter().filter(|run| run.evaluation.is_some()).flat_map(|run| {
-        let here = shifts.iter().filter(|shift| shift.world == run.name.world);
-        here.flat_map(move |shift| shift.values.iter().map(move |&value| (run, shift, value)))
-    })
+    runs: Runs,
+}
+
+impl<'a> Shifted<'a> {
+    /// The runs of a folder under these shifts.
+    ///
+    /// # Errors
+    /// If the folder cannot be read.
+    pub fn read(
+        dir: &'a Path,
+        shifts: &'a [Shift],
+        worlds: &dyn Worlds,
+    ) -> Result<Self, ReportError> {
+        Ok(Shifted { dir, shifts, runs: Runs::read(dir, worlds)? })
+    }
+
+    /// Number of judgements that [`Shifted::write`] makes: every run under every shift of its world.
+    pub fn judgements(&self) -> usize {
+        self.work().count()
+    }
+
+    fn work(&self) -> impl Iterator<Item = (&Run, &Shift, f64)> {
+        self.runs.runs.iter().filter(|run| run.evaluation.is_some()).flat_map(|run| {
+            let here = self.shifts.iter().filter(|shift| shift.world == run.name.world);
+            here.flat_map(move |shift| shift.values.iter().map(move |&value| (run, shift, value)))
+        })
+    }
+
+    /// Judges; writes `shifts.csv` and the figures, and answers with what a reader must know. `judged` is called
+    /// after each run and value.
+    ///
+    /// # Errors
+    /// If the folder cannot be written, or no run can be judged.
+    pub fn write(
+        &self,
+        worlds: &dyn Worlds,
+        judge: &Judge<'_>,
+        judged: &dyn Fn(),
+    ) -> Result<Vec<String>, ReportError> {
+        let dir = self.dir;
+        let mut notes = self.runs.notes.clone();
+        let (mut found, mut refused) = (Vec::new(), Vec::new());
+        for (run, shift, value) in self.work() {
+            let mut constants = run.settings.task.constants.clone();
+            let whole = matches!(constants.get(&shift.constant), Some(toml::Value::Integer(_)));
+            let shifted = match value {
+                value if whole && value.fract() == 0.0 => toml::Value::Integer(value as i64),
+                value => toml::Value::Float(value),
+            };
+            constants.insert(shift.constant.clone(), shifted);
+            match judge(run, &constants) {
+                Ok(law) => {
+                    let (task, eta) = (&run.settings.task, run.name.eta);
+                    let best = worlds.optimum(&run.name.world, &constants, task.gamma, eta);
+                    let optimum = match best {
+                        Optimum::Known(best) => Some(best.cvar(run.alpha())),
+                        _ => None,
+                    };
+                    found.push(Judged { run, constant: &shift.constant, value, law, optimum });
+                }
+                Err(why) => refused.push((&run.name, why)),
+            }
+            judged();
+        }
+        refused.dedup();
+        if found.is_empty() {
+            let none = || "it has no runs of these worlds".to_owned();
+            let what = refused.first().map_or_else(none, |(_, why)| why.clone());
+            return Err(ReportError::NotJudged { dir: dir.to_path_buf(), what });
+        }
+        notes.extend(refused.iter().map(|(run, why)| format!("LEFT OUT: {run}, {why}.")));
+        persist(&dir.join("shifts.csv"), to_csv(&found).as_bytes())?;
+        for figure in drawn(&found) {
+            persist_figure(dir, &figure)?;
+        }
+        Ok(notes)
+    }
 }
 
 /// A line per run and value; `cvar` is empty where its tail holds fewer than ten episodes. `optimum` is the best CVaR_{1/eta} under that value, exact in finite worlds.
