@@ -440,7 +440,7 @@ mod runs {
         let folder = tempfile::tempdir().unwrap();
         let config = config_file(&folder, SMALL);
         let out = folder.path().join("out");
-        let shifts = "experiment.shifts=['lava-grid.slip=0.05,0.2']";
+        let shifts = "experiment.shifts=['lava-grid.slip=0.05,0.2', 'lava-grid.horizon=40,3']";
         let out_path = out.to_str().unwrap();
         let text = answer(&["bench", "--config", &config, "--out", out_path, "--set", shifts]);
         assert!(text.contains("lava-grid") && text.contains("lava-point"), "{text}");
@@ -459,6 +459,7 @@ mod runs {
             worlds.filter(|(world, _)| world == "lava-grid").map(|(_, mean)| mean).collect();
         assert_eq!(of("0.05"), trained);
         assert!(of("0.2").len() == trained.len() && of("0.2") != trained);
+        assert!(of("40") == trained && of("3") != trained);
         assert_eq!(answer(&["table", out.to_str().unwrap()]), text);
         let run = out.join("lava-grid/game/eta-25/seed-1");
         for antagonist in ["nominal", "learned", "exact"] {

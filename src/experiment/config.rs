@@ -62,7 +62,7 @@ pub use catalogue::{Catalogue, MethodInfo, WorldInfo};
 pub use constants::WorldConstants;
 pub use layers::Setting;
 pub use run::{Difference, RunConfig};
-pub use shift::Shift;
+pub use shift::{Shift, as_toml};
 
 /// What is wrong with a configuration, in one line.
 #[derive(Debug, Error)]

@@ -4,7 +4,7 @@
 use super::figures::{self, Figure, Line};
 use super::runs::{Run, Runs, csv_text, number};
 use super::{Optimum, ReportError, Worlds, persist, persist_figure, statistics};
-use crate::experiment::config::Shift;
+use crate::experiment::config::{Shift, as_toml};
 use crate::experiment::names::as_file;
 use crate::game::returns::ReturnLaw;
 use lava_envs::End;
@@ -87,12 +87,7 @@ impl<'a> Shifted<'a> {
         let (mut found, mut refused) = (Vec::new(), Vec::new());
         for (run, shift, value) in self.work() {
             let mut constants = run.settings.task.constants.clone();
-            let whole = matches!(constants.get(&shift.constant), Some(toml::Value::Integer(_)));
-            let shifted = match value {
-                value if whole && value.fract() == 0.0 => toml::Value::Integer(value as i64),
-                value => toml::Value::Float(value),
-            };
-            constants.insert(shift.constant.clone(), shifted);
+            constants.insert(shift.constant.clone(), as_toml(value));
             match judge(run, &constants) {
                 Ok(law) => {
                     let (task, eta) = (&run.settings.task, run.name.eta);

@@ -55,7 +55,16 @@ impl Shift {
     /// Refuses a world or a constant that there is not, and values out of range.
     pub(super) fn check(&self, schema: &Schema) -> Result<(), ConfigError> {
         let key = format!("env.{}.{}", self.world, self.constant);
-        let mut values = self.values.iter().map(|&value| Value::Float(value));
+        let mut values = self.values.iter().copied().map(as_toml);
         values.try_for_each(|value| schema.check(&key, &value, "experiment.shifts"))
+    }
+}
+
+/// A value of a constant: one that is whole as an integer, which real constants take as well.
+pub fn as_toml(value: f64) -> Value {
+    if value.fract() == 0.0 && value.abs() < 1e15 {
+        Value::Integer(value as i64)
+    } else {
+        Value::Float(value)
     }
 }
