@@ -575,13 +575,13 @@ fn check_budgets_for_long<W: Arena>(world: impl Fn() -> W) {
 }
 
 #[test]
-#[ignore = "ten minutes: half a billion steps on each world, in release"]
+#[ignore = "a quarter of an hour: half a billion steps on each world"]
 fn no_antagonist_breaks_the_budget_on_the_grid_for_long() {
     check_budgets_for_long(|| LavaGrid::new(&GridConfig::default(), 250).unwrap());
 }
 
 #[test]
-#[ignore = "ten minutes: half a billion steps on each world, in release"]
+#[ignore = "a quarter of an hour: half a billion steps on each world"]
 fn no_antagonist_breaks_the_budget_at_the_point_mass_for_long() {
     check_budgets_for_long(|| LavaPoint::new(&PointConfig::default(), 250).unwrap());
 }

@@ -340,8 +340,10 @@ fn exact(registry: &Registry, args: &ExactArgs) -> Result<ExitCode> {
     }
     // The solver's page begins with the world and knows nothing of scenes.
     let page = found.to_string();
-    let rest = page.strip_prefix(base_of(world.as_str()));
-    print(&rest.map_or_else(|| page.clone(), |rest| format!("{world}{rest}")))
+    match page.strip_prefix(base_of(world.as_str())) {
+        Some(rest) => print(&format!("{world}{rest}")),
+        None => print(&page),
+    }
 }
 
 fn table(registry: &Registry, args: &TableArgs) -> Result<ExitCode> {

@@ -161,9 +161,8 @@ fn document(speeds: &[f64], [one, two]: [f64; 2], gain: f64) -> String {
     let mut text = format!(
         "# What training costs\n\nEnvironment steps per second of one run on one core, eta = 25, \
          {} thousand steps; medians of {REPEATS} runs, in an order that alternates between the sizes. All \
-         else is as in `configs/default.toml` (250 parallel episodes, 64 hidden units, T = 40), where the players see coordinates; with features they \
-         see what configs/paper.toml shows them, without the time. Made by \
-         `cargo xtask scaling`, which wants a machine that does nothing else. The default size stands in all \
+         else is as in `configs/default.toml` (250 parallel episodes, 64 hidden units, T = 40); with features the players see \
+         the cell, or the waves of the position, and not the time. Made by `cargo xtask scaling`, which wants a machine that does nothing else. The default size stands in all \
          three tables: how far its numbers differ is the noise of the machine.\n\n\
          ![steps per second against the sizes](scaling.svg)\n",
         STEPS / 1_000
