@@ -5,7 +5,10 @@ use cvar_game::exact::oracle::controller::{Controller, Protagonist, Scripted};
 use cvar_game::exact::oracle::lattice::{Scene, Space, cubic};
 use cvar_game::exact::oracle::play::play;
 use cvar_game::exact::oracle::sweep::{Rewards, SWEPT, Utility, smoothed, sweep};
-use cvar_game::exact::oracle::{Certified, Effort, Lattice, certify, certify_cached, shipped};
+use cvar_game::exact::oracle::upper_bound::upper_bound;
+use cvar_game::exact::oracle::{
+    Certified, Effort, Lattice, certify, certify_cached, shipped, shipped_bound,
+};
 use cvar_game::exact::watch::Watch;
 use lava_envs::law::{GaussianLaw, Law};
 use lava_envs::point::Force;
@@ -329,6 +332,31 @@ fn a_contradiction_is_told() {
     certified.lattice_value += 1.01 * certified.lattice_error
         + 1.01 * 0.75 * (certified.certified_cvar_hi - certified.certified_cvar_lo);
     assert!(certified.to_string().contains("WARNING"), "{certified}");
+}
+
+/// Above what is certified, on the scenes that the program comes with and on a short world.
+#[test]
+fn the_upper_bound_is_above_what_is_attained() {
+    for (config, cell) in [(PointConfig::default(), 0.5), (short(), 0.2)] {
+        let bound = upper_bound(&config, cell, 2, &());
+        let mut before = 1.0;
+        for eta in [1.0, 2.0, 25.0, 100.0, 1e4] {
+            let upper = bound.at(1.0 / eta);
+            assert!(upper <= before, "eta {eta}: {upper} above {before}");
+            before = upper;
+        }
+        let attained = quick(&config, 25.0);
+        assert!(bound.at(0.04) > attained.certified_cvar_lo, "{bound:?}");
+        assert!(bound.at(0.04) < 0.9, "{bound:?}");
+        assert_eq!(bound, upper_bound(&config, cell, 1, &()), "it depends on the threads");
+    }
+    let config = PointConfig::default();
+    let bound = shipped_bound(&config).expect("it is shipped");
+    for eta in [1.0, 2.0, 5.0, 10.0, 25.0, 50.0, 100.0] {
+        let certified = shipped(&config, 1.0, eta, &Effort::of(&config)).unwrap();
+        let apart = bound.at(1.0 / eta) - certified.certified_cvar_hi;
+        assert!(apart > 0.0 && apart < 0.3, "eta {eta}: {apart}");
+    }
 }
 
 #[test]

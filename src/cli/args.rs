@@ -266,7 +266,7 @@ pub struct ExactArgs {
     pub eta: Option<f64>,
     /// A finished run's folder, in a finite world: what every single change of its policy is worth, in one cell
     /// another action. At the run's budget, or at --eta.
-    #[arg(long, value_name = "RUN", conflicts_with_all = ["env", "config", "cell", "velocity", "anew", "settings", "scenes", "files"])]
+    #[arg(long, value_name = "RUN", conflicts_with_all = ["env", "config", "cell", "velocity", "upper_cell", "anew", "settings", "scenes", "files"])]
     pub policy: Option<PathBuf>,
     /// Configuration file.
     #[arg(long, value_name = "FILE")]
@@ -277,6 +277,10 @@ pub struct ExactArgs {
     /// lava-point: distance of the lattice's velocities, in m/s [default: fits noise and acceleration; 0.5 by default].
     #[arg(long, value_name = "M/S", allow_negative_numbers = true)]
     pub velocity: Option<f64>,
+    /// lava-point: side of the cells of the upper bound, in m; with half of it computing takes thirty times as long
+    /// [default: 0.2 for an arena of 10 m x 7 m].
+    #[arg(long, value_name = "M", allow_negative_numbers = true)]
+    pub upper_cell: Option<f64>,
     /// lava-point: compute even if there is a certificate.
     #[arg(long)]
     pub anew: bool,

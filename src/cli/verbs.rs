@@ -326,6 +326,7 @@ fn exact(registry: &Registry, args: &ExactArgs) -> Result<ExitCode> {
         source: if args.anew { yardstick::Source::Anew } else { yardstick::Source::Computed },
         cell: args.cell,
         velocity: args.velocity,
+        upper_cell: args.upper_cell,
     };
     let [world] = &config.experiment.envs[..] else {
         bail!("`exact` answers for one scene; give --scene once");

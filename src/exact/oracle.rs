@@ -12,6 +12,7 @@
 //! | the programme: smoothing over noise, maximum over pushes | [`mod@sweep`] |
 //! | the controller, and scripted yardsticks | [`controller`] |
 //! | episodes in the physical world | [`mod@play`] |
+//! | what no policy can surpass | [`mod@upper_bound`] |
 //!
 //! # The risk level
 //! As on the grid, the best CVaR is a search over thresholds w,
@@ -26,14 +27,17 @@
 //!
 //! # How good is it
 //! The lattice fits the noise ([`Lattice::of`]). Its own value of the optimum is not certified, but a check:
-//! [`Certified::doubt`] tells where it contradicts the certificate.
+//! [`Certified::doubt`] tells where it contradicts the certificate. A relaxation of the programme bounds the optimum from
+//! above; [`Bracket`] has both.
 
 pub mod controller;
 pub mod lattice;
 pub mod play;
 pub mod sweep;
+pub mod upper_bound;
 
 use super::watch::{Steps, Watch};
+use super::yardstick::Walk;
 use super::{ExactError, require_eta};
 use crate::files::{read_at_most, write_in_place};
 use crate::game::returns::{NORMAL_95, ReturnLaw};
@@ -41,13 +45,15 @@ use controller::{Controller, Protagonist, Scripted};
 use etcetera::base_strategy::{BaseStrategy as _, Xdg};
 use lattice::Space;
 use lava_envs::{ConfigError, End, PointConfig};
-use play::{Played, play};
+use play::{Played, play, walk};
+use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::fmt::{self, Display, Formatter};
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 use sweep::{PLAYED, Rewards, Rings, SWEPT, Utility, sweep};
+use upper_bound::UpperBound;
 
 /// Name of the world in certificates.
 pub const NAME: &str = "lava-point";
@@ -55,8 +61,15 @@ pub const NAME: &str = "lava-point";
 /// Version of the method and of its file; certificates of other versions are computed again.
 const VERSION: u32 = 2;
 
+/// Version of the upper bound and of its file.
+const BOUNDS_VERSION: u32 = 1;
+
 /// Seed of the episodes that choose the threshold.
 const SELECTION_SEED: u64 = 0x5e1e_c710;
+
+/// Seed of an evaluation by default, and the number of its episodes that a certificate has step by step.
+pub const WALKS_SEED: u64 = 0;
+const WALKS: u64 = 6;
 
 /// Seed of the episodes that certify.
 const CERTIFYING_SEED: u64 = 0xce47_1f1e;
@@ -89,9 +102,7 @@ pub enum OracleError {
     )]
     Walls,
     /// The lattice needs too much memory.
-    #[error(
-        "the oracle's table would take {gibibytes:.1} GiB, more than {MOST_GIBIBYTES}; {advice}"
-    )]
+    #[error("the oracle would take {gibibytes:.1} GiB, more than {MOST_GIBIBYTES}; {advice}")]
     TooLarge {
         /// What it would take.
         gibibytes: f64,
@@ -298,6 +309,9 @@ pub struct Certified {
     pub seconds: f64,
     /// The law of J over the certifying episodes.
     pub law: ReturnLaw,
+    /// The first episodes of an evaluation with the seed [`WALKS_SEED`].
+    #[serde(default)]
+    pub walks: Vec<Walk>,
 }
 
 /// The certificate of a world. `watch` is told how far it is.
@@ -343,7 +357,7 @@ pub fn certify(
         .max_by(|&a, &b| baselines[a].cvar.total_cmp(&baselines[b].cvar))
         .expect("there are scripts");
     let mut selection = problem.select(&scripts[script], &mut steps)?;
-    let mut best = None;
+    let (mut best, mut walks) = (None, None);
     let mut chosen = (baselines[script].name.clone(), None);
     let mut lattice_value = f64::NEG_INFINITY;
     for &(_, threshold) in ranked.iter().take(effort.candidates.max(1)) {
@@ -356,14 +370,15 @@ pub fn certify(
         if selected >= selection {
             selection = selected;
             best = Some(problem.certify(&controller, &mut steps)?);
+            walks = Some(problem.walks(&controller)?);
             chosen = (CONTROLLER.to_owned(), threshold);
         } else {
             steps.next(problem.playing(effort.episodes)).done(1.0);
         }
     }
-    let mut best = match best {
+    let (mut best, mut walks) = match best.zip(walks) {
         Some(best) => best,
-        None => problem.certify(&scripts[script], &mut steps)?,
+        None => (problem.certify(&scripts[script], &mut steps)?, problem.walks(&scripts[script])?),
     };
 
     // A script whose few episodes say that it is better is heard in as many.
@@ -373,6 +388,7 @@ pub fn certify(
             *baseline = Baseline::new(scripted.name(), &played.law, alpha);
             if baseline.cvar > best.law.cvar(alpha) {
                 best = played;
+                walks = problem.walks(scripted)?;
                 chosen = (scripted.name(), None);
             }
         }
@@ -414,6 +430,7 @@ pub fn certify(
         baselines,
         seconds: began.elapsed().as_secs_f64(),
         law,
+        walks,
     })
 }
 
@@ -500,6 +517,12 @@ impl Problem<'_> {
         let episodes = self.effort.episodes;
         let step = steps.next(self.playing(episodes));
         self.play(protagonist, episodes, CERTIFYING_SEED, &step)
+    }
+
+    /// A few episodes of a protagonist, step by step.
+    fn walks(&self, protagonist: &dyn Protagonist) -> Result<Vec<Walk>, ConfigError> {
+        let walk = |index| walk(self.config, self.gamma, protagonist, WALKS_SEED, index);
+        (0..WALKS).map(walk).collect()
     }
 
     /// Cost of playing, in the unit of [`sweep::cost`]: half an episode of a controller and of the engine.
@@ -637,11 +660,11 @@ struct Key<'a> {
 /// Most bytes of a certificate on disk; that of the default world has a hundredth.
 const LARGEST_ENTRY: u64 = 1 << 26;
 
-/// A certificate on disk.
+/// What is kept on disk.
 #[derive(Serialize, Deserialize)]
-struct Entry {
+struct Entry<T> {
     key: String,
-    certified: Certified,
+    certified: T,
 }
 
 /// The certificates that come with the program: those of the default world at the paper's budgets,
@@ -652,7 +675,8 @@ const SHIPPED: &str = include_str!("../../configs/oracle.json");
 /// regret against it without computing for minutes, and the same on every machine.
 pub fn shipped(config: &PointConfig, gamma: f64, eta: f64, effort: &Effort) -> Option<Certified> {
     let key = key(config, gamma, eta, effort);
-    let entries: Vec<Entry> = serde_json::from_str(SHIPPED).expect("a test reads the file");
+    let entries: Vec<Entry<Certified>> =
+        serde_json::from_str(SHIPPED).expect("a test reads the file");
     entries.into_iter().find(|entry| entry.key == key).map(|entry| entry.certified)
 }
 
@@ -672,11 +696,8 @@ pub fn certify_cached(
     if let Some(certified) = shipped(config, gamma, eta, effort) {
         return Ok(certified);
     }
-    let key = key(config, gamma, eta, effort);
-    let found = read_at_most(&file_of(&key, folder), LARGEST_ENTRY).ok();
-    let found = found.and_then(|bytes| serde_json::from_slice::<Entry>(&bytes).ok());
-    match found.filter(|entry| entry.key == key) {
-        Some(entry) => Ok(entry.certified),
+    match kept(&key(config, gamma, eta, effort), folder) {
+        Some(certified) => Ok(certified),
         None => certify_anew(config, gamma, eta, effort, folder, watch),
     }
 }
@@ -695,7 +716,24 @@ pub fn certify_anew(
     watch: &dyn Watch,
 ) -> Result<Certified, OracleError> {
     let certified = certify(config, gamma, eta, effort, watch)?;
-    let entry = Entry { key: key(config, gamma, eta, effort), certified };
+    Ok(keep(key(config, gamma, eta, effort), certified, folder, watch))
+}
+
+/// What a folder has under a key; a file that does not fit is nothing.
+fn kept<T: DeserializeOwned>(key: &str, folder: &Path) -> Option<T> {
+    let bytes = read_at_most(&file_of(key, folder), LARGEST_ENTRY).ok()?;
+    let entry = serde_json::from_slice::<Entry<T>>(&bytes).ok()?;
+    (entry.key == key).then_some(entry.certified)
+}
+
+/// Leaves something under a key in a folder. Where that cannot be done `watch` is told why: it is not lost.
+fn keep<T: Serialize + DeserializeOwned>(
+    key: String,
+    certified: T,
+    folder: &Path,
+    watch: &dyn Watch,
+) -> T {
+    let entry = Entry { key, certified };
     let path = file_of(&entry.key, folder);
     let text = serde_json::to_string(&entry).expect("a certificate has a JSON form");
     let kept =
@@ -708,8 +746,107 @@ pub fn certify_anew(
         ));
     }
     // Reading rounds the last bit of some numbers: all callers get the same ones, the first too.
-    let Entry { certified, .. } = serde_json::from_str(&text).expect("its own form is read");
-    Ok(certified)
+    let Entry { certified, .. } =
+        serde_json::from_str::<Entry<T>>(&text).expect("its own form is read");
+    certified
+}
+
+/// The upper bounds that come with the program: those of its scenes (`cvar-game exact --env lava-point/SCENE --eta 1
+/// --upper-cell M`).
+const SHIPPED_BOUNDS: &str = include_str!("../../configs/upper-bounds.json");
+
+/// All that an upper bound depends on, but for the side of its cells.
+#[derive(Serialize)]
+struct BoundKey<'a> {
+    version: u32,
+    world: &'a PointConfig,
+}
+
+/// The upper bound that comes with the program, if there is one of this world, for gamma = 1.
+pub fn shipped_bound(world: &PointConfig) -> Option<UpperBound> {
+    let entries: Vec<Entry<UpperBound>> =
+        serde_json::from_str(SHIPPED_BOUNDS).expect("a test reads the file");
+    let key = bound_key(world);
+    entries.into_iter().find(|entry| entry.key == key).map(|entry| entry.certified)
+}
+
+fn bound_key(world: &PointConfig) -> String {
+    let key = BoundKey { version: BOUNDS_VERSION, world };
+    serde_json::to_string(&key).expect("numbers have a JSON form")
+}
+
+/// The upper bound of a world, for gamma = 1, on cells of this side in m, or of the side that comes with the program or by
+/// default. It is looked for in a folder first, if there is one, and left there. `None` where there is no bound.
+///
+/// # Errors
+/// If the side is out of range.
+pub fn bound_cached(
+    world: &PointConfig,
+    cell: Option<f64>,
+    folder: Option<&Path>,
+    watch: &dyn Watch,
+) -> Result<Option<UpperBound>, OracleError> {
+    let Some(default) = upper_bound::default_cell(world) else { return Ok(None) };
+    if let (None, Some(bound)) = (cell, shipped_bound(world)) {
+        return Ok(Some(bound));
+    }
+    let cell = cell.unwrap_or(default);
+    if !(cell > 0.0 && cell <= widest(world)) {
+        let allowed =
+            format!("above 0 and at most {} m, a quarter of the shorter side", widest(world));
+        return Err(OracleError::Lattice { field: "upper-cell", value: cell, allowed });
+    }
+    let gibibytes = upper_bound::bytes(world, cell) / GIBIBYTE;
+    if gibibytes > MOST_GIBIBYTES {
+        let advice = format!("--upper-cell {default} fits");
+        return Err(OracleError::TooLarge { gibibytes, advice });
+    }
+    let key = format!("{} {cell}", bound_key(world));
+    if let Some(bound) = folder.and_then(|folder| kept(&key, folder)) {
+        return Ok(Some(bound));
+    }
+    let bound = upper_bound::upper_bound(world, cell, all_cores(), watch);
+    Ok(Some(match folder {
+        Some(folder) => keep(key, bound, folder, watch),
+        None => bound,
+    }))
+}
+
+/// What is known of the best CVaR: a controller that attains it from below, and a bound from above.
+#[derive(Debug, Clone, Serialize)]
+pub struct Bracket {
+    /// The certificate of the controller.
+    #[serde(flatten)]
+    pub certified: Certified,
+    /// No policy has a CVaR above this; `None` where there is no bound.
+    pub upper_bound: Option<f64>,
+    /// Side of the cells of that bound in m.
+    pub upper_cell: Option<f64>,
+}
+
+impl Bracket {
+    /// Both ends.
+    pub fn new(certified: Certified, bound: Option<&UpperBound>) -> Bracket {
+        Bracket {
+            upper_bound: bound.map(|bound| bound.at(certified.alpha)),
+            upper_cell: bound.map(|bound| bound.cell),
+            certified,
+        }
+    }
+}
+
+impl Display for Bracket {
+    fn fmt(&self, f: &mut Formatter<'_>) -> fmt::Result {
+        write!(f, "{}", self.certified)?;
+        if let (Some(bound), Some(cell)) = (self.upper_bound, self.upper_cell) {
+            writeln!(
+                f,
+                "\nNo policy has a CVaR above {bound:.4}: the bound of a relaxation on cells of {cell} m. Smaller cells \
+                 (--upper-cell) bring it down."
+            )?;
+        }
+        Ok(())
+    }
 }
 
 fn key(world: &PointConfig, gamma: f64, eta: f64, effort: &Effort) -> String {

@@ -8,7 +8,7 @@
 //! | world | yardstick |
 //! |---|---|
 //! | of finitely many states | solved exactly, see [`super::finite`]; more in [`ExactYardstick`] |
-//! | `lava-point` | the certified controller of [`super::oracle`], a lower bound of the optimum |
+//! | `lava-point` | the certified controller of [`super::oracle`], a lower bound of the optimum, and an upper bound |
 //! | any other | none, unless its [`Solvable`] implementation has one |
 //!
 //! ```
@@ -33,14 +33,18 @@ use super::finite::{ExactWorld, Exposure};
 use super::law::evaluate;
 use super::mdp::FiniteMdp;
 use super::optimum::Optimum;
-use super::oracle::{self, Certified, Effort, OracleError};
+use super::oracle::upper_bound::UpperBound;
+use super::oracle::{self, Bracket, Certified, Effort, OracleError};
+use super::policy::Policy;
 use super::require_eta;
 use super::response::{self, Frozen, Response};
 use super::stationary;
 use super::table::TablePolicy;
-use super::watch::Watch;
+use super::watch::{Steps, Watch};
 use crate::game::returns::ReturnLaw;
-use lava_envs::{LavaGrid, LavaPoint, PointConfig, World};
+use lava_envs::law::{Law, sample_index};
+use lava_envs::random::{Purpose, stream};
+use lava_envs::{End, LavaGrid, LavaPoint, PointConfig, World};
 use serde::{Deserialize, Serialize};
 use std::fmt::Display;
 use std::sync::{Arc, Mutex};
@@ -75,7 +79,8 @@ impl Solvable for LavaPoint {
         effort.lattice.cell = options.cell.unwrap_or(effort.lattice.cell);
         effort.lattice.velocity = options.velocity.unwrap_or(effort.lattice.velocity);
         let constants = constants.clone();
-        Ok(Some(Box::new(Oracle { constants, gamma, effort, source: options.source })))
+        let Options { source, upper_cell, .. } = *options;
+        Ok(Some(Box::new(Oracle { constants, gamma, effort, source, upper_cell })))
     }
 }
 
@@ -107,6 +112,9 @@ pub struct Options {
     pub cell: Option<f64>,
     /// Distance of the lattice's velocities, in m/s; the oracle's default if `None`.
     pub velocity: Option<f64>,
+    /// Side of the cells of the upper bound, in m; that of the bound that comes with the program, or the default, if
+    /// `None`.
+    pub upper_cell: Option<f64>,
 }
 
 /// Where certificates come from. Exact solutions take milliseconds and are always computed.
@@ -256,6 +264,13 @@ pub trait Yardstick: Send + Sync {
     /// If the budget is out of range, or the optimum cannot be computed.
     fn optimal_law(&self, eta: f64) -> Result<Option<ReturnLaw>, YardstickError>;
 
+    /// Episodes of a policy that is optimal at a budget, or the best known, on the streams of an evaluation with this seed,
+    /// from the first on: so many, or fewer, or none where they are not at hand.
+    ///
+    /// # Errors
+    /// If the budget is out of range, or the optimum cannot be computed.
+    fn walks(&self, eta: f64, seed: u64, count: u64) -> Result<Vec<Walk>, YardstickError>;
+
     /// Compares a policy with the best at a budget; `None` where the optimum is not known or the
     /// evidence does not say enough.
     ///
@@ -337,6 +352,23 @@ pub trait ExactYardstick: Send + Sync {
     fn frontier(&self, etas: &[f64], alpha: f64) -> Result<Vec<[f64; 2]>, ExactError>;
 }
 
+/// An episode of a policy under nominal chance, step by step.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Walk {
+    /// Index of the episode in the evaluation's streams.
+    pub index: u64,
+    /// How it ended.
+    pub end: End,
+    /// Its return J.
+    pub value: f64,
+    /// Where it was, from the start on: n + 1 places (cells or m).
+    pub path: Vec<[f64; 2]>,
+    /// Chosen actions, as arrows.
+    pub actions: Vec<[f64; 2]>,
+    /// Outcomes of chance, as arrows.
+    pub outcomes: Vec<[f64; 2]>,
+}
+
 /// The exact laws of the return of one policy under nominal chance.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Laws {
@@ -378,6 +410,34 @@ impl<W: World> Exact<W> {
         Ok(optimum)
     }
 
+    /// One episode of a deterministic policy.
+    fn walk(&self, policy: &Policy, seed: u64, index: u64) -> Walk {
+        let (model, mdp) = (self.world.model(), self.mdp());
+        let mut chance = stream(seed, Purpose::EvaluationOutcomes, index);
+        let place = |state: usize| model.coordinates(state).map(|place| place as f64);
+        let mut node = mdp.start_node();
+        let mut walk = Walk {
+            index,
+            end: End::Timeout,
+            value: 0.0,
+            path: vec![place(node.state)],
+            actions: Vec::new(),
+            outcomes: Vec::new(),
+        };
+        loop {
+            let action = policy.action(mdp, node);
+            let outcome = sample_index(&model.probabilities(node.state, action), &mut chance);
+            walk.actions.push(model.arrow(action));
+            let arrow = W::Law::outcome(outcome).map(W::outcome_arrow);
+            walk.outcomes.push(arrow.expect("outcomes of a finite world have indices"));
+            walk.path.push(place(mdp.outcome(node.state, action, outcome).next));
+            if let Some((end, value)) = mdp.ending(node, action, outcome) {
+                return Walk { end, value, ..walk };
+            }
+            node = mdp.successor(node, action, outcome).expect("the episode has not ended");
+        }
+    }
+
     /// CVaR_{1/eta} of the best stationary policy found.
     fn stationary(&self, eta: f64) -> Result<f64, ExactError> {
         let optimum = self.optimum(eta)?;
@@ -398,6 +458,11 @@ impl<W: World> Yardstick for Exact<W> {
 
     fn optimal_law(&self, eta: f64) -> Result<Option<ReturnLaw>, YardstickError> {
         Ok(Some(self.optimum(eta)?.evaluation.law.clone()))
+    }
+
+    fn walks(&self, eta: f64, seed: u64, count: u64) -> Result<Vec<Walk>, YardstickError> {
+        let optimum = self.optimum(eta)?;
+        Ok((0..count).map(|index| self.walk(&optimum.policy, seed, index)).collect())
     }
 
     fn compare(
@@ -517,11 +582,26 @@ struct Oracle {
     gamma: f64,
     effort: Effort,
     source: Source,
+    upper_cell: Option<f64>,
 }
 
 impl Oracle {
+    /// The upper bound; `None` where there is none, or none comes with the program and nothing may be computed.
+    fn bound(&self, watch: &dyn Watch) -> Result<Option<UpperBound>, OracleError> {
+        if self.gamma != 1.0 {
+            return Ok(None);
+        }
+        match self.source {
+            Source::Shipped => Ok(oracle::shipped_bound(&self.constants)),
+            Source::Computed | Source::Anew => {
+                let folder = oracle::cache_folder();
+                oracle::bound_cached(&self.constants, self.upper_cell, folder.as_deref(), watch)
+            }
+        }
+    }
+
     fn certified(&self, eta: f64, watch: &dyn Watch) -> Result<Option<Certified>, OracleError> {
-        let Oracle { constants, gamma, effort, source } = self;
+        let Oracle { constants, gamma, effort, source, .. } = self;
         let gamma = *gamma;
         Ok(match (source, oracle::cache_folder()) {
             (Source::Shipped, _) => oracle::shipped(constants, gamma, eta, effort),
@@ -542,11 +622,20 @@ impl Yardstick for Oracle {
         eta: f64,
         watch: &dyn Watch,
     ) -> Result<Option<Box<dyn Answer>>, YardstickError> {
-        Ok(self.certified(eta, watch)?.map(|certified| Box::new(certified) as Box<dyn Answer>))
+        let mut steps = Steps::new(watch, 2.0);
+        let Some(certified) = self.certified(eta, &steps.next(1.0))? else { return Ok(None) };
+        let bound = self.bound(&steps.next(1.0))?;
+        Ok(Some(Box::new(Bracket::new(certified, bound.as_ref()))))
     }
 
     fn optimal_law(&self, eta: f64) -> Result<Option<ReturnLaw>, YardstickError> {
         Ok(self.certified(eta, &())?.map(|certified| certified.law))
+    }
+
+    fn walks(&self, eta: f64, seed: u64, count: u64) -> Result<Vec<Walk>, YardstickError> {
+        let certified = self.certified(eta, &())?.filter(|_| seed == oracle::WALKS_SEED);
+        let walks = certified.map_or(Vec::new(), |certified| certified.walks);
+        Ok(walks.into_iter().take(count as usize).collect())
     }
 
     fn compare(

@@ -297,7 +297,7 @@ impl Space {
 }
 
 /// Displacement in s per unit of v+ in free flight.
-fn reach(config: &PointConfig) -> f64 {
+pub(super) fn reach(config: &PointConfig) -> f64 {
     let left = config.velocity_retention.powf(1.0 / f64::from(config.substeps));
     let travel: f64 = (0..config.substeps).map(|k| left.powi(k as i32)).sum();
     config.substep() * travel

@@ -2,11 +2,12 @@
 
 use super::controller::Protagonist;
 use crate::exact::watch::Watch;
+use crate::exact::yardstick::Walk;
 use crate::game::returns::{Atom, ReturnLaw};
 use lava_envs::law::{GaussianLaw, Law};
 use lava_envs::point::Force;
 use lava_envs::random::{Purpose, stream};
-use lava_envs::{ConfigError, LavaPoint, PointConfig, Step, World};
+use lava_envs::{ConfigError, End, LavaPoint, PointConfig, Step, World};
 use nalgebra::Vector2;
 use std::sync::Mutex;
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -41,13 +42,7 @@ pub fn play(
 ) -> Result<Played, ConfigError> {
     config.validate()?;
     let blank = Episode {
-        atom: Atom {
-            value: 0.0,
-            undiscounted: 0.0,
-            steps: 0,
-            end: lava_envs::End::Timeout,
-            mass: 0.0,
-        },
+        atom: Atom { value: 0.0, undiscounted: 0.0, steps: 0, end: End::Timeout, mass: 0.0 },
         crossing: None,
     };
     let mut records = vec![blank; episodes as usize];
@@ -78,6 +73,49 @@ pub fn play(
         crossed: crossings.len() as f64 / episodes as f64,
         law: ReturnLaw::recorded(records.into_iter().map(|record| record.atom)),
     })
+}
+
+/// One episode of a seed's streams under nominal chance, step by step, with four decimals.
+///
+/// # Errors
+/// If the configuration is out of range.
+pub fn walk(
+    config: &PointConfig,
+    gamma: f64,
+    protagonist: &dyn Protagonist,
+    seed: u64,
+    index: u64,
+) -> Result<Walk, ConfigError> {
+    let mut world = LavaPoint::new(config, 1)?;
+    let mut chance = stream(seed, Purpose::EvaluationOutcomes, index);
+    let mut own = stream(seed, Purpose::EvaluationActions, index);
+    let rounded = |pair: [f64; 2]| pair.map(|number| (number * 1e4).round() / 1e4);
+    let mut walk = Walk {
+        index,
+        end: End::Timeout,
+        value: 0.0,
+        path: vec![rounded(world.position(0))],
+        actions: Vec::new(),
+        outcomes: Vec::new(),
+    };
+    let (mut discount, mut value) = (1.0, 0.0);
+    for time in 0..config.horizon {
+        let action = protagonist.act(time, world.position(0), world.velocity(0), &mut own);
+        let outcome = GaussianLaw.sample(&mut chance);
+        let mut step = [Step::IDLE];
+        world.apply(&[action], &[outcome], &mut step);
+        value += discount * step[0].reward;
+        discount *= gamma;
+        walk.path.push(rounded(world.position(0)));
+        walk.actions.push(rounded(LavaPoint::action_arrow(action)));
+        walk.outcomes.push(rounded(LavaPoint::outcome_arrow(outcome)));
+        if let Some(end) = step[0].end {
+            walk.end = end;
+            break;
+        }
+    }
+    walk.value = (value * 1e4).round() / 1e4;
+    Ok(walk)
 }
 
 #[derive(Debug, Clone, Copy)]

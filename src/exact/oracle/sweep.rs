@@ -228,7 +228,7 @@ fn limited([a, b, c, d]: [f32; 4], weights: [f32; 4]) -> f32 {
 type Ends = [f32; ENDINGS];
 
 /// Numbers that are computed at once: an arithmetic operation on an array of them is one on a vector register.
-const LANES: usize = 8;
+pub(super) const LANES: usize = 8;
 
 #[derive(Debug, Clone, Copy)]
 struct Sizes {
@@ -300,7 +300,7 @@ impl Work {
 
 /// `sums[k] = sum_m weights[m] terms[first + m stride + k]` for `count` numbers, and for what fills their last lanes.
 #[inline(always)]
-fn combine(
+pub(super) fn combine(
     sums: &mut [f32],
     count: usize,
     weights: &[f32],
