@@ -11,7 +11,10 @@ use cvar_game::exact::table::TablePolicy;
 use cvar_game::exact::yardstick::{
     Evidence, ExactYardstick, Exploitability, Options, Solvable, Source, Yardstick, YardstickError,
 };
-use lava_envs::{GridConfig, LavaGrid, LavaPoint, PointConfig, World};
+use lava_envs::random::{Purpose, stream};
+use lava_envs::{
+    Discrete, End, GridConfig, LavaGrid, LavaPoint, Law, Move, PointConfig, Step, World,
+};
 
 const ETA: f64 = 25.0;
 
@@ -247,4 +250,34 @@ fn a_single_change_is_worth_what_the_changed_policy_attains() {
     }
     // Nothing is better than what is optimal.
     assert!(exact.changes(1.0, &timed).unwrap().changes.iter().all(|of| of.gain < 1e-12));
+}
+
+/// A walk of the optimum meets the noise of the evaluation, and what it says of itself is right.
+#[test]
+fn walks_of_the_optimum_are_episodes_of_the_world() {
+    let constants = GridConfig { slip: 0.3, ..GridConfig::default() };
+    let yardstick = LavaGrid::yardstick(&constants, 1.0, &Options::default()).unwrap().unwrap();
+    let walks = yardstick.walks(1.0, 7, 300).unwrap();
+    let mut ends = Vec::new();
+    for (index, walk) in walks.iter().enumerate() {
+        let mut world = LavaGrid::new(&constants, 1).unwrap();
+        let mut chance = stream(7, Purpose::EvaluationOutcomes, index as u64);
+        let (mut value, mut end) = (0.0, None);
+        for (step, &arrow) in walk.actions.iter().enumerate() {
+            assert_eq!(world.position(0), walk.path[step]);
+            let moves = (0..4).map(Move::from_index);
+            let action = moves.clone().find(|&of| LavaGrid::action_arrow(of) == arrow).unwrap();
+            let outcome = world.law(0, action).sample(&mut chance);
+            assert_eq!(LavaGrid::outcome_arrow(outcome), walk.outcomes[step]);
+            let mut steps = [Step::IDLE];
+            world.apply(&[action], &[outcome], &mut steps);
+            value += steps[0].reward;
+            end = steps[0].end;
+        }
+        assert_eq!((end, world.position(0)), (Some(walk.end), *walk.path.last().unwrap()));
+        assert!((value - walk.value).abs() < 1e-9);
+        ends.push(walk.end);
+    }
+    assert!(ends.contains(&End::Goal) && ends.contains(&End::Lava));
+    assert_eq!(yardstick.walks(1.0, 7, 3).unwrap(), walks[..3]);
 }

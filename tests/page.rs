@@ -120,6 +120,7 @@ fn every_figure_is_drawn_as_svg_with_text_and_as_png() {
     assert_eq!(
         names,
         [
+            "lava-grid-overview",
             "lava-grid-map",
             "lava-grid-occupancy",
             "lava-grid-deviations",
@@ -129,8 +130,10 @@ fn every_figure_is_drawn_as_svg_with_text_and_as_png() {
             "lava-grid-cross",
             "lava-grid-learning",
             "lava-grid-budget",
+            "lava-point-overview",
             "lava-point-trajectories",
             "lava-point-shifts",
+            "lava-point-race",
             "lava-point-frontier",
             "lava-point-regret",
             "lava-point-profile",
@@ -150,7 +153,12 @@ fn every_figure_is_drawn_as_svg_with_text_and_as_png() {
     // The shares of both antagonists, which no axis can show by chance.
     let deviations = &figure("lava-grid-deviations").picture.svg;
     assert!(deviations.contains(".38") && deviations.contains(".62"), "{deviations}");
-    assert!(figure("lava-grid-deviations").caption.contains("1000 trajectories"));
+    let caption = &figure("lava-grid-deviations").caption;
+    assert!(caption.contains("1000 trajectories"));
+    assert!(caption.contains("eta = 25: (0, 0) 0.38 and 0.62, (1, 0) 0.38 and 0.62"), "{caption}");
+    // Two dots that move, one for each budget.
+    let race = &figure("lava-point-race").picture.svg;
+    assert_eq!(race.matches("attributeName=\"cx\"").count(), 2, "{race}");
 }
 
 /// The committed figures are those of the committed archive.
@@ -248,12 +256,14 @@ fn runs_without_figure_data_report_all_the_same() {
     assert_eq!(
         drawn,
         [
+            "lava-grid-overview",
             "lava-grid-map",
             "lava-grid-frontier",
             "lava-grid-regret",
             "lava-grid-profile",
             "lava-grid-cross",
             "lava-grid-learning",
+            "lava-point-overview",
             "lava-point-frontier",
             "lava-point-profile",
             "lava-point-cross",
@@ -289,7 +299,7 @@ fn damaged_figure_data_is_named_and_left_out() {
         let written = report::write_all(dir.path(), standard()).unwrap();
         let [note] = &written.figures.notes[..] else { panic!("{:?}", written.figures.notes) };
         assert!(note.contains("seed-2/figure_data.json") && note.contains(said), "{note}");
-        assert_eq!(written.figures.drawn.len(), 17);
+        assert_eq!(written.figures.drawn.len(), 20);
         let page = fs::read_to_string(dir.path().join("report.html")).unwrap();
         assert!(page.contains("Missing in the figures: ") && page.contains(said));
     }
@@ -310,15 +320,23 @@ fn the_page_works_in_a_browser() {
         const of = (id) => document.getElementById(id);
         const rows = () => [...document.querySelector("tbody").rows].map((row) => row.cells[0].textContent).join();
         const result = { before: rows() };
+        const pick = (id, value) => { of(id).value = value; of(id).dispatchEvent(new Event("change")); };
+        pick("only-world", "lava-grid");
+        result.worlds = [...document.querySelectorAll("[data-world]")]
+          .filter((part) => part.offsetParent !== null).map((part) => part.dataset.world);
+        result.env = of("env").value;
+        pick("only-world", "");
+        const best = [...of("beside").options].find((option) => option.text === "the best known, eta = 1");
+        pick("beside", best.value);
+        result.beside = of("beside-step").textContent;
+        pick("beside", "");
+        result.alone = of("beside-stage").hidden;
         document.querySelector("th button").click();
         document.querySelector("th button").click();
         result.sorted = rows();
-        of("env").value = "lava-point";
-        of("env").dispatchEvent(new Event("change"));
-        of("eta").value = "25";
-        of("eta").dispatchEvent(new Event("change"));
-        of("chance").value = "antagonist";
-        of("chance").dispatchEvent(new Event("change"));
+        pick("env", "lava-point");
+        pick("eta", "25");
+        pick("chance", "antagonist");
         result.start = of("step").textContent;
         of("play").click();
         setTimeout(() => {
@@ -360,6 +378,10 @@ fn the_page_works_in_a_browser() {
             "scrubbed",
             "step 1 of 2 · remaining budget 12.5 · likelihood ratio of the last outcome 2.00",
         );
+        let worlds = result["worlds"].as_array().unwrap();
+        assert!(worlds.len() > 5 && worlds.iter().all(|world| world == "lava-grid"), "{result}");
+        assert_eq!((&result["env"], &result["alone"]), (&"lava-grid".into(), &true.into()));
+        said("beside", "the best known, eta = 1 · step 0 of");
         assert_eq!(result["wide"], 0, "the page is wider than {width} pixels");
     }
 }

@@ -14,7 +14,7 @@ use super::runner::Report;
 use super::steps::{self, Format};
 use super::stop::Stop;
 use crate::exact::watch::Watch;
-use crate::exact::yardstick::{Answer, Options, Solvable, Source};
+use crate::exact::yardstick::{Answer, Options, Solvable, Source, Walk, Yardstick};
 use crate::files::{LARGEST_FILE, read_at_most};
 use crate::game::returns::ReturnLaw;
 use crate::learn::family::Perturbed;
@@ -250,6 +250,21 @@ pub trait Entry: Any + Send + Sync {
         eta: f64,
     ) -> Result<Option<ReturnLaw>, RunError>;
 
+    /// Episodes of that policy, on the streams of an evaluation with this seed; see [`Yardstick::walks`].
+    ///
+    /// [`Yardstick::walks`]: crate::exact::yardstick::Yardstick::walks
+    ///
+    /// # Errors
+    /// As [`AnyWorld::optimum`].
+    fn walks(
+        &self,
+        constants: &toml::Table,
+        gamma: f64,
+        eta: f64,
+        seed: u64,
+        count: u64,
+    ) -> Result<Vec<Walk>, RunError>;
+
     /// What an episode can be: the least and the greatest return, discounted by gamma, and the time limit.
     /// `None` if the constants are not the world's own, or it does not say.
     fn limits(&self, constants: &toml::Table, gamma: f64) -> Option<Limits>;
@@ -459,12 +474,18 @@ impl<W: Arena + Solvable> Entry for WorldEntry<W> {
         gamma: f64,
         eta: f64,
     ) -> Result<Option<ReturnLaw>, RunError> {
-        let constants = WorldConstants { world: WorldName::of::<W>(), table: of.clone() };
-        let constants = self::constants::<W>(&constants)?;
-        let options = Options { source: Source::Shipped, ..Options::default() };
-        let yardstick = W::yardstick(&constants, gamma, &options)?;
-        let yardstick = yardstick.ok_or_else(|| RunError::NoYardstick(W::NAME.to_owned()))?;
-        Ok(yardstick.optimal_law(eta)?)
+        Ok(shipped_yardstick::<W>(of, gamma)?.optimal_law(eta)?)
+    }
+
+    fn walks(
+        &self,
+        of: &toml::Table,
+        gamma: f64,
+        eta: f64,
+        seed: u64,
+        count: u64,
+    ) -> Result<Vec<Walk>, RunError> {
+        Ok(shipped_yardstick::<W>(of, gamma)?.walks(eta, seed, count)?)
     }
 
     fn limits(&self, constants: &toml::Table, gamma: f64) -> Option<Limits> {
@@ -472,4 +493,16 @@ impl<W: Arena + Solvable> Entry for WorldEntry<W> {
         let world = W::new(&constants, 1).ok()?;
         Some(Limits { returns: world.return_range(gamma)?, horizon: world.horizon() })
     }
+}
+
+/// The yardstick of a world with these constants, from what comes with the program.
+fn shipped_yardstick<W: Arena + Solvable>(
+    of: &toml::Table,
+    gamma: f64,
+) -> Result<Box<dyn Yardstick>, RunError> {
+    let constants = WorldConstants { world: WorldName::of::<W>(), table: of.clone() };
+    let constants = self::constants::<W>(&constants)?;
+    let options = Options { source: Source::Shipped, ..Options::default() };
+    let yardstick = W::yardstick(&constants, gamma, &options)?;
+    yardstick.ok_or_else(|| RunError::NoYardstick(W::NAME.to_owned()))
 }

@@ -12,7 +12,7 @@
 //! several folders side by side. Methods and variants in one folder are compared in the same way.
 //! [`shifts::Shifted`] judges the policies where the world is another than in training.
 //!
-//! Nothing is simulated here ([`shifts`] has its caller play) and nothing is random: the same artefacts give the same bytes. What a world looks like, and its exact optima, are asked from
+//! Nothing is simulated here ([`shifts`] has its caller play, and a few episodes of the optimum are its yardstick's) and nothing is random: the same artefacts give the same bytes. What a world looks like, and its exact optima, are asked from
 //! [`Worlds`].
 
 pub mod cross;
@@ -30,6 +30,7 @@ pub mod table;
 
 pub use render::screen_width;
 
+use crate::exact::yardstick::Walk;
 use crate::experiment::config::{RunConfig, scenes};
 use crate::experiment::failure::RunError;
 use crate::experiment::registry::{Limits, Registry};
@@ -43,6 +44,9 @@ use render::{Csv, Json, Markdown, Render, Terminal};
 use runs::Runs;
 use std::path::{Path, PathBuf};
 use table::{Results, Table};
+
+/// Most episodes of the best policy that a page shows.
+const WALKS: u64 = 6;
 
 /// What the report asks about worlds, which it knows only by their names, and about configurations.
 pub trait Worlds {
@@ -62,6 +66,16 @@ pub trait Worlds {
 
     /// The best policy that is known at a budget.
     fn optimum(&self, world: &str, constants: &toml::Table, gamma: f64, eta: f64) -> Optimum;
+
+    /// The first episodes of that policy in an evaluation with this seed, as far as they are at hand.
+    fn walks(
+        &self,
+        world: &str,
+        constants: &toml::Table,
+        gamma: f64,
+        eta: f64,
+        seed: u64,
+    ) -> Vec<Walk>;
 
     /// What an episode can be; `None` if the world is not known or does not say.
     fn limits(&self, world: &str, constants: &toml::Table, gamma: f64) -> Option<Limits>;
@@ -114,6 +128,18 @@ impl Worlds for Registry {
             Err(RunError::NoYardstick(_)) => Optimum::None,
             Err(error) => Optimum::Refused(error.to_string()),
         }
+    }
+
+    fn walks(
+        &self,
+        world: &str,
+        constants: &toml::Table,
+        gamma: f64,
+        eta: f64,
+        seed: u64,
+    ) -> Vec<Walk> {
+        let walks = self.named(world).map(|of| of.walks(constants, gamma, eta, seed, WALKS));
+        walks.and_then(Result::ok).unwrap_or_default()
     }
 
     fn limits(&self, world: &str, constants: &toml::Table, gamma: f64) -> Option<Limits> {

@@ -1,12 +1,15 @@
 //! `report.html`: one page with everything, that needs no network and no other file.
 //!
-//! Summary first, then tables, figures, a player of stored episodes, and how each number was made.
+//! A figure per world that says it all, then the summary, tables, figures, a player of stored episodes, and how each number
+//! was made. Worlds and methods can be chosen: what has the attribute `data-world` or `data-method` is hidden with them.
 
 use super::Worlds;
-use super::figures::{Figures, Panel, Picture};
+use super::figures::{Figure, Figures, OVERVIEW, Panel, Picture};
 use super::render::{columns, legend, row_headings, row_name, rows, seeds, words};
 use super::runs::Run;
 use super::table::{Block, Cell, Row, Table, World};
+use crate::exact::yardstick::Walk;
+use crate::experiment::artefacts::Chance;
 use crate::experiment::figure_data::StoredEpisode;
 use lava_envs::scene::Scene;
 use maud::{DOCTYPE, Markup, PreEscaped, html};
@@ -38,6 +41,7 @@ pub fn render(
             body {
                 header {
                     h1 { "Results: " (name) }
+                    (choice(table))
                     nav {
                         a href="#summary" { "Summary" }
                         a href="#tables" { "Tables" }
@@ -47,7 +51,7 @@ pub fn render(
                     }
                 }
                 main {
-                    section id="summary" { h2 { "Summary" } (summary(table)) }
+                    section id="summary" { h2 { "Summary" } (summary(table, figures)) }
                     section id="tables" { h2 { "Tables" } (tables(table)) }
                     section id="figures" { h2 { "Figures" } (pictures(figures)) }
                     section id="episodes-played" { h2 { "Episodes" } (player(&episodes)) }
@@ -60,15 +64,48 @@ pub fn render(
     page.into_string()
 }
 
-/// The main numbers of each row in a sentence, and what a reader must know before trusting them.
-fn summary(table: &Table) -> Markup {
+/// Which world and which method are shown, where there are several.
+fn choice(table: &Table) -> Markup {
+    let worlds: Vec<&str> = table.worlds.iter().map(|world| world.name.as_str()).collect();
+    let mut methods: Vec<&str> = Vec::new();
+    for row in table.worlds.iter().flat_map(|world| &world.rows).filter(|row| !row.reference) {
+        if table.heading.is_some() && !methods.contains(&row.name.as_str()) {
+            methods.push(&row.name);
+        }
+    }
+    let select = |id: &str, words: &str, all: &str, names: &[&str]| {
+        html! {
+            label hidden[names.len() < 2] { (words) select id=(id) {
+                option value="" { (all) }
+                @for name in names { option { (name) } }
+            } }
+        }
+    };
+    html! {
+        form id="choice" hidden[worlds.len() < 2 && methods.len() < 2] {
+            (select("only-world", "world", "all worlds", &worlds))
+            (select("only-method", "method", "all methods", &methods))
+        }
+    }
+}
+
+/// The figure of each world that says it all, the main numbers of each row in a sentence, and what a reader must know
+/// before trusting them.
+fn summary(table: &Table, figures: &Figures) -> Markup {
     html! {
         @for note in &table.notes { p.note { (note) } }
         p { "A protagonist learns to reach a goal past lava while an antagonist reweights chance within a budget eta. "
             "If it is deterministic and both play their best, it maximises CVaR at alpha = 1/eta: the mean of its worst returns." }
         @for world in &table.worlds {
-            h3 { (world.name) }
-            ul { @for row in &world.rows { @if !row.reference { li { (sentence(table, row)) } } } }
+            div data-world=(world.name) {
+                h3 { (world.name) }
+                @for figure in figures.drawn.iter().filter(|of| opens(of) && of.world == world.name) {
+                    figure id=(figure.name) { (drawing(figure, NARROW)) }
+                }
+                ul { @for row in &world.rows { @if !row.reference {
+                    li data-method=(row.name) { (sentence(table, row)) }
+                } } }
+            }
         }
     }
 }
@@ -107,8 +144,10 @@ fn tables(table: &Table) -> Markup {
         @for world in &table.worlds {
             @for block in Block::ALL {
                 @if !columns(world, block).is_empty() {
-                    h3 { (world.name) ": " (block.title(world)) }
-                    div.scroll tabindex="0" { (one_table(table, world, block)) }
+                    div data-world=(world.name) {
+                        h3 { (world.name) ": " (block.title(world)) }
+                        div.scroll tabindex="0" { (one_table(table, world, block)) }
+                    }
                 }
             }
         }
@@ -127,7 +166,7 @@ fn one_table(table: &Table, world: &World, block: Block) -> Markup {
             } }
             tbody {
                 @for row in rows(world, &columns) {
-                    tr {
+                    tr data-method=[(!row.reference).then_some(&row.name)] {
                         @for name in row_name(table, row) { td data-value=(name) { (name) } }
                         @let (count, failed) = seeds(row);
                         td data-value=(row.seeds) { (count) @if let Some(failed) = failed { small { (failed) } } }
@@ -156,11 +195,10 @@ fn sort_key(cell: Cell) -> Option<f64> {
 
 fn pictures(figures: &Figures) -> Markup {
     html! {
-        @for figure in &figures.drawn {
-            figure id=(figure.name) {
+        @for figure in figures.drawn.iter().filter(|of| !opens(of)) {
+            figure id=(figure.name) data-world=(figure.world) {
                 h3 { (figure.title) }
-                div.scroll tabindex="0" role="img" aria-label=(figure.title) { (PreEscaped(scalable(&figure.picture))) }
-                figcaption { (figure.caption) }
+                (drawing(figure, WIDE))
             }
         }
         @if !figures.missing.is_empty() {
@@ -170,12 +208,28 @@ fn pictures(figures: &Figures) -> Markup {
     }
 }
 
+/// Whether a page opens with a figure.
+fn opens(figure: &Figure) -> bool {
+    figure.name.ends_with(OVERVIEW)
+}
+
+/// Least widths of figures in pixels: of those that can be read on a phone, and of those with more to be seen.
+const NARROW: u32 = 330;
+const WIDE: u32 = 620;
+
+fn drawing(figure: &Figure, least: u32) -> Markup {
+    html! {
+        div.scroll tabindex="0" role="img" aria-label=(figure.title) { (PreEscaped(scalable(&figure.picture, least))) }
+        figcaption { (figure.caption) }
+    }
+}
+
 /// Its width in pixels becomes the largest one: on a narrower page the viewBox keeps the shape.
-fn scalable(Picture { svg, width }: &Picture) -> String {
+fn scalable(Picture { svg, width }: &Picture, least: u32) -> String {
     let Some((head, rest)) = svg.split_once('>') else { return svg.clone() };
     let kept = |word: &&str| !word.starts_with("width=") && !word.starts_with("height=");
     let head: Vec<&str> = head.split(' ').filter(kept).collect();
-    let style = format!("max-width:{width}px;min-width:min({width}px,620px)");
+    let style = format!("max-width:{width}px;min-width:min({width}px,{least}px)");
     format!("{} style=\"{style}\">{rest}", head.join(" "))
 }
 
@@ -187,19 +241,26 @@ fn player(episodes: &Episodes) -> Markup {
     html! {
         p { "The greedy protagonist's episodes, the first ones and the first that end in lava. Blue arrow: the "
             "chosen action; rose arrow: the outcome of chance. In nominal episodes the likelihood ratios are those that the learned "
-            "antagonist would have given to these outcomes." }
+            "antagonist would have given to these outcomes. Beside it: another policy in the same nominal episode, with the same noise." }
         div id="player" {
             div.row {
                 @for (id, words) in [("env", "world"), ("method", "method"), ("eta", "eta"), ("seed", "seed"), ("chance", "under"), ("episode", "episode")] {
                     label hidden[id == "method" && episodes.runs.iter().all(|run| run.method.is_none())] { (words) select id=(id) {} }
                 }
+                label { "beside" select id="beside" {} }
             }
             div.row {
                 button id="play" type="button" { "Play" }
                 input id="scrub" type="range" min="0" step="1" value="0" aria-label="step";
             }
-            output id="step" aria-live="off" {}
-            canvas id="scene" width="1000" height="700" role="img" aria-label="the episode in its world" {}
+            div id="stages" {
+                @for (place, words) in [("", "the episode in its world"), ("beside-", "the same episode of the policy beside it")] {
+                    div id=(format!("{place}stage")) {
+                        output id=(format!("{place}step")) aria-live="off" {}
+                        canvas id=(format!("{place}scene")) width="1000" height="700" role="img" aria-label=(words) {}
+                    }
+                }
+            }
         }
         // A tag or a comment inside the data would end the script, or keep it from ending.
         script id="episodes" type="application/json" { (PreEscaped(json.replace('<', "\\u003c"))) }
@@ -294,7 +355,10 @@ struct Played {
     env: String,
     method: Option<String>,
     eta: f64,
-    seed: u64,
+    /// `None` of the best policy, which has no seed.
+    seed: Option<u64>,
+    /// Seed of the evaluation: episodes of one index meet the same noise.
+    stream: Option<u64>,
     /// Place in `scenes`.
     scene: usize,
     stored: Vec<StoredEpisode>,
@@ -303,9 +367,10 @@ struct Played {
 impl Episodes {
     fn of(panels: &[Panel], worlds: &dyn Worlds) -> Episodes {
         let mut episodes = Episodes { scenes: Vec::new(), runs: Vec::new() };
+        let mut best: Vec<Played> = Vec::new();
         for panel in panels {
-            let constants = &panel.task().constants;
-            let Some(scene) = worlds.scene(panel.group.env, constants) else { continue };
+            let task = panel.task();
+            let Some(scene) = worlds.scene(panel.group.env, &task.constants) else { continue };
             let stored = panel.seeds.iter().filter_map(|(run, records)| {
                 let data = records.figure_data.as_ref().filter(|of| !of.stored.is_empty())?;
                 Some((run, &data.stored))
@@ -315,15 +380,58 @@ impl Episodes {
                 episodes.scenes.push(scene);
                 episodes.scenes.len() - 1
             });
-            episodes.runs.extend(stored.take(PLAYED_SEEDS).map(|(run, stored)| Played {
-                env: run.name.world.clone(),
-                method: panel.group.method.clone(),
-                eta: run.name.eta,
-                seed: run.name.seed,
-                scene: place,
-                stored: stored.clone(),
-            }));
+            let shown: Vec<Played> = stored
+                .take(PLAYED_SEEDS)
+                .map(|(run, stored)| Played {
+                    env: run.name.world.clone(),
+                    method: panel.group.method.clone(),
+                    eta: run.name.eta,
+                    seed: Some(run.name.seed),
+                    stream: run.settings.stream(),
+                    scene: place,
+                    stored: stored.clone(),
+                })
+                .collect();
+            let (env, eta) = (panel.group.env, panel.group.eta);
+            let stream = shown.iter().find_map(|of| of.stream);
+            let known = |of: &Played| (of.scene, of.eta, of.stream) == (place, eta, stream);
+            if let Some(stream) = stream
+                && !best.iter().any(known)
+            {
+                let walks = worlds.walks(env, &task.constants, task.gamma, eta, stream);
+                best.extend((!walks.is_empty()).then(|| Played {
+                    env: env.to_owned(),
+                    method: Some(BEST.to_owned()),
+                    eta,
+                    seed: None,
+                    stream: Some(stream),
+                    scene: place,
+                    stored: walks.into_iter().map(stored_episode).collect(),
+                }));
+            }
+            episodes.runs.extend(shown);
         }
+        episodes.runs.extend(best);
         episodes
+    }
+}
+
+/// What the best policy that is known is called.
+const BEST: &str = "the best known";
+
+/// An episode without an antagonist.
+fn stored_episode(of: Walk) -> StoredEpisode {
+    let Walk { index, end, value, path, actions, outcomes } = of;
+    let (ratios, budgets) = (Vec::new(), Vec::new());
+    StoredEpisode {
+        chance: Chance::Nominal,
+        index,
+        end,
+        value,
+        path,
+        actions,
+        outcomes,
+        ratios,
+        budgets,
     }
 }

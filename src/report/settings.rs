@@ -106,6 +106,11 @@ impl Settings {
         self.evaluation.iter()
     }
 
+    /// The seed of the evaluation's streams, where it is known.
+    pub fn stream(&self) -> Option<u64> {
+        self.evaluation.get("evaluation.seed")?.as_integer()?.try_into().ok()
+    }
+
     /// All that tells settings apart, by dotted key.
     fn keys(&self) -> BTreeMap<String, Value> {
         let task = self.task.keys().into_iter();

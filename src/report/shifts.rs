@@ -199,6 +199,7 @@ fn drawn(judged: &[Judged<'_>]) -> Vec<Figure> {
         }
         Some(Figure {
             name: format!("{}-{constant}-eta-{eta}", as_file(&world)),
+            world: world.clone(),
             title: format!("{world}, eta = {eta}: another {constant} than in training"),
             caption,
             picture,

@@ -245,6 +245,35 @@ pub fn moment(scene: &Scene, trail: &[[f64; 2]]) -> Option<Picture> {
     })
 }
 
+/// A picture of a place in the plane.
+pub(super) struct Stage(Origin);
+
+impl Stage {
+    /// A place in the units of the canvas.
+    pub(super) fn at(&self, x: f64, y: f64) -> (i32, i32) {
+        at(self.0, x, y)
+    }
+}
+
+/// The scene side by side under each title, and where. `None` if it is too large.
+pub(super) fn stage(scene: &Scene, titles: &[String]) -> Option<(Picture, Vec<Stage>)> {
+    if !is_drawable(scene) {
+        return None;
+    }
+    let places: Vec<(usize, usize)> = (0..titles.len()).map(|column| (column, 0)).collect();
+    let layout = Layout { strip: 0, ..layout(scene, &places, 1) };
+    let origins: Vec<Origin> =
+        places.iter().map(|(column, row)| layout.origin(*column, *row)).collect();
+    let picture = figure(layout.size(), |canvas| {
+        for (origin, words) in origins.iter().zip(titles) {
+            title(canvas, *origin, words, INK)?;
+            arena(canvas, scene, *origin)?;
+        }
+        Ok(())
+    })?;
+    Some((picture, origins.into_iter().map(Stage).collect()))
+}
+
 /// The data of a panel's seeds that are of cells.
 fn of_cells<'a>(panel: &'a Panel) -> impl Iterator<Item = &'a CellData> {
     panel.seeds.iter().filter_map(|(_, records)| match &records.figure_data.as_ref()?.world {
@@ -340,14 +369,33 @@ pub(super) fn deviations(scene: &Scene, panels: &[(usize, &Panel)]) -> Option<(P
         panel.seeds.iter().find_map(|(_, records)| Some(records.figure_data.as_ref()?.episodes))
     };
     let episodes = maps.iter().find_map(data).unwrap_or_default();
+    let largest: Vec<String> = (maps.iter())
+        .filter_map(|(panel, maps)| {
+            Some(format!("{}: {}", panel.group.title(), apart(&grid, maps)?))
+        })
+        .collect();
     let caption = format!(
         "As in the paper's Figure 4: probability that the executed move is not the chosen one, greedy \
          protagonist. Above against its learned antagonist, counted over {episodes} trajectories per seed; \
          below against the exact worst case, computed for the same policies. Seeds pooled; cells with at \
-         least {LEAST_VISITS} visits. Without an antagonist: {}",
+         least {LEAST_VISITS} visits. Largest differences, learned and exact: {}. Without an antagonist: {}",
+        largest.join("; "),
         scene.rules
     );
     Some((picture, caption))
+}
+
+/// The three cells in which two maps differ most, with both values; `None` if no cell is in both.
+fn apart(grid: &Grid, [learned, exact]: &[Vec<Option<f64>>; 2]) -> Option<String> {
+    let both = |cell: usize| Some((cell, learned[cell]?, exact[cell]?));
+    let mut cells: Vec<(usize, f64, f64)> = (0..grid.cells()).filter_map(both).collect();
+    cells.sort_by(|a, b| (b.1 - b.2).abs().total_cmp(&(a.1 - a.2).abs()).then(a.0.cmp(&b.0)));
+    let named = cells.iter().take(3).map(|(cell, learned, exact)| {
+        let (x, y) = grid.corner(*cell);
+        format!("({x}, {y}) {learned:.2} and {exact:.2}")
+    });
+    let named: Vec<String> = named.collect();
+    (!named.is_empty()).then(|| named.join(", "))
 }
 
 /// Lava, goal, walls, start and border of a place in the plane.

@@ -2,9 +2,11 @@
 //!
 //! | figure | module |
 //! |---|---|
+//! | how far every row is from the best that is known | `overview` |
 //! | learning curves, frontier, cross matrix, regret, budget over time | `curves` |
 //! | worlds of cells: the map, where the protagonist goes, where its antagonists change its moves | `maps` |
 //! | worlds in the plane: trajectories, how the antagonist shifts the noise | `maps` |
+//! | worlds in the plane: episodes that run, of the least and the greatest budget | `race` |
 //! | what a constant of the world does, where the runs differ in it | `axis` |
 //! | panels, colours, axes, PNG | `canvas` |
 //!
@@ -15,6 +17,8 @@ mod axis;
 mod canvas;
 mod curves;
 mod maps;
+mod overview;
+mod race;
 
 pub use canvas::{Picture, png, rgb};
 pub use curves::{Line, lines};
@@ -28,11 +32,16 @@ use super::settings::Task;
 use super::table::Results;
 use crate::experiment::names::as_file;
 
+/// Name of the figure that a page opens with.
+pub const OVERVIEW: &str = "overview";
+
 /// A finished figure.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Figure {
     /// Name of its files, such as `lava-grid-frontier`.
     pub name: String,
+    /// The world that it is of.
+    pub world: String,
     /// Headline.
     pub title: String,
     /// What it shows, and how it was made.
@@ -104,6 +113,7 @@ impl Figures {
         let mut add = |name: &str, title: &str, figure: Option<(Picture, String)>| match figure {
             Some((picture, caption)) => self.drawn.push(Figure {
                 name: format!("{}-{name}", as_file(env)),
+                world: env.to_owned(),
                 title: format!("{env}: {title}"),
                 caption,
                 picture,
@@ -113,6 +123,10 @@ impl Figures {
         // Maps show the panels of one and the same world.
         let (here, elsewhere): (Vec<_>, Vec<_>) =
             (panels.iter().enumerate()).partition(|(_, panel)| panel.task() == task);
+        let overview = overview::overview(panels);
+        if overview.is_some() {
+            add(OVERVIEW, "how far from the best", overview);
+        }
         match &scene {
             Some(scene) if scene.cells => {
                 add("map", "the map", maps::map(scene));
@@ -126,6 +140,10 @@ impl Figures {
             Some(scene) => {
                 add("trajectories", "where the protagonist goes", maps::trajectories(scene, &here));
                 add("shifts", "how the antagonist shifts the noise", maps::shifts(scene, &here));
+                let race = race::race(scene, &here);
+                if race.is_some() {
+                    add("race", "the same episodes at two budgets", race);
+                }
             }
             None => {}
         }
