@@ -25,7 +25,10 @@ def program(*arguments: str) -> str:
 @pytest.mark.parametrize("eta", [1.0, 25.0, 100.0])
 def test_the_optimum_is_that_of_the_program(world: str, eta: float) -> None:
     told = json.loads(program("exact", "--env", world, "--eta", str(eta), "--json"))
-    assert cvar_game.exact(world, eta).details == told
+    exact = cvar_game.exact(world, eta)
+    assert exact.details == told
+    assert exact.upper_bound is not None and exact.upper_bound >= exact.cvar
+    assert (exact.upper_bound == exact.cvar) == (world == "lava-grid")
 
 
 @pytest.mark.parametrize("slip", [0.05, 0.2])

@@ -189,8 +189,9 @@ struct Programme<'a> {
     shifted: Vec<[usize; 2]>,
     /// Weights of the noise, by boxes from a node to a cell of y' shifted by half a box.
     weights: Vec<f32>,
-    /// By box beyond the cell of y along one axis: how many boxes beyond it the push reaches along the other.
-    reaches: Vec<usize>,
+    /// By box beyond the cell of y along one axis: how many boxes beyond it the push reaches along the other; `None`
+    /// where it does not reach the box.
+    reaches: Vec<Option<usize>>,
     /// What steps end in, by cell of p; empty where none does.
     codes: Vec<Vec<u8>>,
     /// What a cell of p lies in wholly.
@@ -222,12 +223,8 @@ impl<'a> Programme<'a> {
         let reaches = (0..=sizes.push)
             .map(|beyond| {
                 let gap = beyond.saturating_sub(1) as f64;
-                if beyond > 0 && gap > push {
-                    return usize::MAX; // out of reach
-                }
                 // Boxes with (their own gap)^2 + gap^2 <= push^2.
-                let left = (push * push - gap * gap).max(0.0).sqrt();
-                left.floor() as usize + 1
+                (gap <= push).then(|| (push * push - gap * gap).sqrt().floor() as usize + 1)
             })
             .collect();
         let first = -((sizes.band * FINER + sizes.push + sizes.tails) as i64);
@@ -642,10 +639,7 @@ impl Programme<'_> {
                 } else {
                     (beyond_x + 1).saturating_sub(push + FINER)
                 };
-                let reach = self.reaches[beyond];
-                if reach == usize::MAX {
-                    continue;
-                }
+                let Some(reach) = self.reaches[beyond] else { continue };
                 let width = FINER + 2 * reach;
                 let level = width.ilog2() as usize;
                 let span = 1 << level;
@@ -784,9 +778,8 @@ mod tests {
                     let box_ = ((mean[axis] - config.radius) / side).floor() as i64 - first;
                     (-box_).max(box_ + 1 - FINER as i64).max(0)
                 });
-                let reach =
-                    programme.reaches.get(beyond[0] as usize).copied().unwrap_or(usize::MAX);
-                assert!(reach != usize::MAX && beyond[1] as usize <= reach, "{beyond:?}");
+                let reach = programme.reaches.get(beyond[0] as usize).copied().flatten();
+                assert!(reach.is_some_and(|reach| beyond[1] as usize <= reach), "{beyond:?}");
 
                 // In each cell of p that the position is in, and of y' that the noise leads to.
                 let own = [0, 1].map(|axis| ((position[axis] - config.radius) / cell) as usize);

@@ -44,6 +44,9 @@ class Exact:
     cvar: float
     """The best CVaR_alpha of the return: exact on lava-grid, that of the oracle's certified controller on
     lava-point, a lower bound of the best."""
+    upper_bound: float | None
+    """No policy has a CVaR_alpha above this: :attr:`cvar` on lava-grid, a bound by a relaxation on lava-point;
+    ``None`` where none is known."""
     policy: npt.NDArray[np.float64] | None = field(repr=False)
     """A policy that attains it, action probabilities of shape ``(horizon, states, actions)``; ``None`` on
     lava-point."""
@@ -154,8 +157,9 @@ def exact(
     eta, gamma = eta_of(eta), number("gamma", gamma)
     details = json.loads(world._core.exact(eta, gamma, compute))
     best = details.get("optimal_cvar", details.get("certified_cvar"))
+    upper_bound = details.get("upper_bound", details.get("optimal_cvar"))
     policy = world._core.optimal_policy(eta, gamma)
-    return Exact(world.name, eta, 1.0 / eta, float(best), policy, details)
+    return Exact(world.name, eta, 1.0 / eta, float(best), upper_bound, policy, details)
 
 
 def evaluate(
