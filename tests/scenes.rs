@@ -1,7 +1,7 @@
 //! Scenes: every one of the program keeps the promises of a world, in both worlds, and configurations place worlds on
 //! them.
 
-use cvar_game::exact::oracle::{Effort, shipped};
+use cvar_game::exact::oracle::{Effort, shipped, shipped_bound};
 use cvar_game::experiment::config::{Config, ConfigError, Setting, Source, scenes};
 use cvar_game::experiment::names::RunId;
 use cvar_game::experiment::plan;
@@ -251,7 +251,7 @@ fn the_optima_are_those_of_an_independent_programme() {
     }
 }
 
-/// The certificates of lava-point come with the program, and docs/scenes.md has their values.
+/// The certificates of lava-point and its upper bounds come with the program, and docs/scenes.md has their values.
 #[test]
 fn every_scene_has_shipped_certificates() {
     for row in documented(3) {
@@ -263,7 +263,10 @@ fn every_scene_has_shipped_certificates() {
             let best =
                 certified.baselines.iter().map(|script| script.cvar).fold(f64::MIN, f64::max);
             assert!(certified.certified_cvar >= best, "{name}, eta {eta}: {certified}");
-            format!("{:.3}", certified.certified_cvar)
+            let bound = shipped_bound(&config).unwrap_or_else(|| panic!("{name} has no bound"));
+            let above = bound.at(1.0 / eta);
+            assert!(above > certified.certified_cvar_hi, "{name}, eta {eta}: {above}");
+            format!("{:.3} ({above:.3})", certified.certified_cvar)
         });
         assert_eq!(found, row[1..], "{name}");
     }
