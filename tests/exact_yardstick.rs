@@ -191,7 +191,12 @@ fn lava_point_is_measured_by_its_oracle() {
     let yardstick = LavaPoint::yardstick(&constants, 1.0, &options).unwrap().unwrap();
     assert!(yardstick.exact().is_none());
     let certified = oracle::shipped(&constants, 1.0, ETA, &Effort::of(&constants)).unwrap();
-    assert_eq!(yardstick.answer(ETA, &()).unwrap().unwrap().to_string(), certified.to_string());
+    let bound = oracle::shipped_bound(&constants).unwrap();
+    let bracket = oracle::Bracket::new(certified.clone(), Some(&bound));
+    assert_eq!(yardstick.answer(ETA, &()).unwrap().unwrap().to_string(), bracket.to_string());
+    let walks = yardstick.walks(ETA, oracle::WALKS_SEED, 3).unwrap();
+    assert_eq!((walks.len(), &walks[..]), (3, &certified.walks[..3]));
+    assert!(yardstick.walks(ETA, oracle::WALKS_SEED + 1, 3).unwrap().is_empty(), "other noise");
     let law = yardstick.optimal_law(ETA).unwrap().unwrap();
     assert_eq!(law, certified.law);
     // The oracle's own episodes as those of a policy.

@@ -12,9 +12,10 @@
 //! | how far is a trained policy from the optimum | [`certificate`] |
 //! | what is a policy of any method to an exact solver | [`table`] |
 //! | all of it in any finite world | [`finite`] |
-//! | what can be attained certifiably on the point mass, where nothing is exact | [`oracle`] |
+//! | what can be attained on the point mass, where nothing is exact, and what cannot | [`oracle`] |
 //! | what single changes of a policy are worth | [`changes`] |
 //! | all of it for any world, by one interface | [`yardstick`] |
+//! | what does an episode of the best policy look like | [`mod@walk`] |
 //! | how far is a computation that takes minutes | [`mod@watch`] |
 //!
 //! Symbols: budget eta >= 1, risk level alpha = 1/eta, return J, threshold w, time t, state s, outcome
@@ -33,6 +34,7 @@ pub mod policy;
 pub mod response;
 pub mod stationary;
 pub mod table;
+pub mod walk;
 pub mod watch;
 pub mod yardstick;
 

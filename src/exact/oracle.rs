@@ -36,8 +36,8 @@ pub mod play;
 pub mod sweep;
 pub mod upper_bound;
 
+use super::walk::Walk;
 use super::watch::{Steps, Watch};
-use super::yardstick::Walk;
 use super::{ExactError, require_eta};
 use crate::files::{read_at_most, write_in_place};
 use crate::game::returns::{NORMAL_95, ReturnLaw};

@@ -40,6 +40,7 @@ use super::require_eta;
 use super::response::{self, Frozen, Response};
 use super::stationary;
 use super::table::TablePolicy;
+use super::walk::Walk;
 use super::watch::{Steps, Watch};
 use crate::game::returns::ReturnLaw;
 use lava_envs::law::{Law, sample_index};
@@ -350,23 +351,6 @@ pub trait ExactYardstick: Send + Sync {
     /// # Errors
     /// If a budget or alpha is out of range.
     fn frontier(&self, etas: &[f64], alpha: f64) -> Result<Vec<[f64; 2]>, ExactError>;
-}
-
-/// An episode of a policy under nominal chance, step by step.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub struct Walk {
-    /// Index of the episode in the evaluation's streams.
-    pub index: u64,
-    /// How it ended.
-    pub end: End,
-    /// Its return J.
-    pub value: f64,
-    /// Where it was, from the start on: n + 1 places (cells or m).
-    pub path: Vec<[f64; 2]>,
-    /// Chosen actions, as arrows.
-    pub actions: Vec<[f64; 2]>,
-    /// Outcomes of chance, as arrows.
-    pub outcomes: Vec<[f64; 2]>,
 }
 
 /// The exact laws of the return of one policy under nominal chance.

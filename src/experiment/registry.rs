@@ -13,8 +13,9 @@ use super::run;
 use super::runner::Report;
 use super::steps::{self, Format};
 use super::stop::Stop;
+use crate::exact::walk::Walk;
 use crate::exact::watch::Watch;
-use crate::exact::yardstick::{Answer, Options, Solvable, Source, Walk, Yardstick};
+use crate::exact::yardstick::{Answer, Options, Solvable, Source, Yardstick};
 use crate::files::{LARGEST_FILE, read_at_most};
 use crate::game::returns::ReturnLaw;
 use crate::learn::family::Perturbed;
@@ -255,7 +256,7 @@ pub trait Entry: Any + Send + Sync {
     /// [`Yardstick::walks`]: crate::exact::yardstick::Yardstick::walks
     ///
     /// # Errors
-    /// As [`AnyWorld::optimum`].
+    /// As [`Entry::optimum`].
     fn walks(
         &self,
         constants: &toml::Table,

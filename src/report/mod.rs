@@ -30,7 +30,7 @@ pub mod table;
 
 pub use render::screen_width;
 
-use crate::exact::yardstick::Walk;
+use crate::exact::walk::Walk;
 use crate::experiment::config::{RunConfig, scenes};
 use crate::experiment::failure::RunError;
 use crate::experiment::registry::{Limits, Registry};

@@ -8,7 +8,7 @@ use super::figures::{Figure, Figures, OVERVIEW, Panel, Picture};
 use super::render::{columns, legend, row_headings, row_name, rows, seeds, words};
 use super::runs::Run;
 use super::table::{Block, Cell, Row, Table, World};
-use crate::exact::yardstick::Walk;
+use crate::exact::walk::Walk;
 use crate::experiment::artefacts::Chance;
 use crate::experiment::figure_data::StoredEpisode;
 use lava_envs::scene::Scene;

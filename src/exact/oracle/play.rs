@@ -1,8 +1,8 @@
 //! Playing a protagonist in the physical world: this, and not the lattice, is what certifies.
 
 use super::controller::Protagonist;
+use crate::exact::walk::Walk;
 use crate::exact::watch::Watch;
-use crate::exact::yardstick::Walk;
 use crate::game::returns::{Atom, ReturnLaw};
 use lava_envs::law::{GaussianLaw, Law};
 use lava_envs::point::Force;

@@ -40,7 +40,7 @@
 //! cells become smaller, in proportion.
 //!
 //! It holds for the motion of a point between walls, in exact arithmetic. The world's own single precision differs from that by
-//! rounding, about 1e-6 m; sums here are rounded in favour of the protagonist ([`MARGIN`]).
+//! rounding, about 1e-6 m; sums here are rounded in favour of the protagonist (`MARGIN`).
 
 use super::lattice::reach;
 use super::sweep::{LANES, combine};
