@@ -277,8 +277,8 @@ pub struct ExactArgs {
     /// lava-point: distance of the lattice's velocities, in m/s [default: fits noise and acceleration; 0.5 by default].
     #[arg(long, value_name = "M/S", allow_negative_numbers = true)]
     pub velocity: Option<f64>,
-    /// lava-point: side of the cells of the upper bound, in m; with half of it computing takes thirty times as long
-    /// [default: 0.2 for an arena of 10 m x 7 m].
+    /// lava-point: side of the cells of the upper bound, in m; with half of it there are sixteen times as many
+    /// [default: of a bound that comes with the program its own, else 0.2 for an arena of 10 m x 7 m].
     #[arg(long, value_name = "M", allow_negative_numbers = true)]
     pub upper_cell: Option<f64>,
     /// lava-point: compute even if there is a certificate.

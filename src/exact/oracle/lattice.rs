@@ -480,7 +480,13 @@ impl From<Ending> for End {
     }
 }
 
-fn time_to_box(from: [f64; 2], path: [f64; 2], min: [f64; 2], max: [f64; 2]) -> Option<f64> {
+/// Share of a straight path after which it is in a box.
+pub(super) fn time_to_box(
+    from: [f64; 2],
+    path: [f64; 2],
+    min: [f64; 2],
+    max: [f64; 2],
+) -> Option<f64> {
     let (mut enter, mut leave) = (0.0_f64, 1.0_f64);
     for axis in 0..2 {
         if path[axis] == 0.0 {

@@ -37,12 +37,12 @@
 //!   max_pi CVaR_alpha(J) <= max over returns w of { w - S(start, w) / alpha },   for every alpha at once.
 //!
 //! The cells' sides tell how much is given away: about a cell in every step, which is a stronger push. So the bound comes down as
-//! cells become smaller, in proportion.
+//! cells become smaller.
 //!
 //! It holds for the motion of a point between walls, in exact arithmetic. The world's own single precision differs from that by
 //! rounding, about 1e-6 m; sums here are rounded in favour of the protagonist (`MARGIN`).
 
-use super::lattice::reach;
+use super::lattice::{reach, time_to_box};
 use super::sweep::{LANES, combine};
 use crate::exact::watch::Watch;
 use crate::game::columns::{Loops, widest};
@@ -453,23 +453,9 @@ fn holds(Rectangle { min, max }: Rectangle, point: [f64; 2]) -> bool {
 
 /// Whether a straight path meets a rectangle; an empty one is met by none.
 fn crosses(Rectangle { min, max }: Rectangle, from: [f64; 2], to: [f64; 2]) -> bool {
-    let (mut enter, mut leave) = (0.0_f64, 1.0_f64);
-    for axis in 0..2 {
-        if min[axis] > max[axis] {
-            return false;
-        }
-        let path = to[axis] - from[axis];
-        if path == 0.0 {
-            if from[axis] < min[axis] || from[axis] > max[axis] {
-                return false;
-            }
-        } else {
-            let (a, b) = ((min[axis] - from[axis]) / path, (max[axis] - from[axis]) / path);
-            enter = enter.max(a.min(b));
-            leave = leave.min(a.max(b));
-        }
-    }
-    enter <= leave
+    let path = [to[0] - from[0], to[1] - from[1]];
+    let empty = (0..2).any(|axis| min[axis] > max[axis]);
+    !empty && time_to_box(from, path, min, max).is_some()
 }
 
 /// A list made by several threads.

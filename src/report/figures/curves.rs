@@ -174,7 +174,7 @@ pub(super) fn regret(panels: &[Panel]) -> Option<(Picture, String)> {
 }
 
 /// Regrets of at most this are drawn as this.
-const LEAST_REGRET: f64 = 1e-3;
+pub(super) const LEAST_REGRET: f64 = 1e-3;
 
 /// The performance profile: the share of runs whose regret is at most so much (Agarwal and others, NeurIPS 2021). A run
 /// without a result never is among them.

@@ -2,11 +2,9 @@
 
 use super::Panel;
 use super::canvas::{INK, LAVA, Picture, TEXT, colour, figure, short, text, words_width};
+use super::curves::LEAST_REGRET as LEAST;
 use plotters::prelude::*;
 use plotters::style::text_anchor::{HPos, VPos};
-
-/// Regrets of at most this are drawn as this.
-const LEAST: f64 = 1e-3;
 
 /// Height of a row, and of the words above the rows of a budget.
 const ROW: i32 = 46;
@@ -103,7 +101,7 @@ pub(super) fn overview(panels: &[Panel]) -> Option<(Picture, String)> {
     });
     let caption = format!(
         "Regret: the best CVaR_1/eta that is known, minus that of the greedy protagonist (at eta = 1 of means). Dots are \
-         seeds, the bar is the mean of those that did not fail with its 95 % interval, on a logarithmic axis; regrets \
+         seeds, the bar is the mean of those that did not fail (of all, where all did) with its 95 % interval, on a logarithmic axis; regrets \
          below {LEAST} are drawn there, and ends of intervals too. Orange: failed."
     );
     shown.first().and(picture).map(|picture| (picture, caption))
