@@ -59,6 +59,9 @@ fn every_scene_keeps_the_promises_of_both_worlds() {
         check::<LavaGrid>(&cells);
         check::<LavaPoint>(&point(&config, &format!("lava-point/{name}")));
         assert!(scene.about.ends_with('.'), "{name} says {:?}", scene.about);
+        let difficulty = scene.difficulty.unwrap();
+        let known = ["distance", "gap", "route", "goal", "memory"];
+        assert!(known.contains(&&*difficulty), "{name} says {difficulty:?}");
     }
 }
 

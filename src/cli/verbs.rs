@@ -427,7 +427,8 @@ fn envs(registry: &Registry, args: &EnvsArgs) -> Result<ExitCode> {
         texts.push("# Scenes, for `--scene NAME` and as WORLD/NAME:".to_owned());
         for (name, scene) in scenes::all() {
             let map = scene.map.to_string();
-            let lines = [format!("{name}: {}", scene.about)]
+            let difficulty = scene.difficulty.map_or(String::new(), |hard| format!(" ({hard})"));
+            let lines = [format!("{name}{difficulty}: {}", scene.about)]
                 .into_iter()
                 .chain(map.lines().map(str::to_owned));
             texts.push(lines.map(|line| format!("# {line}\n")).collect());

@@ -176,8 +176,12 @@ fn environment(repository: &Path) -> Environment<'static> {
     environment.add_function("crossings", move |folder: &str, world: &str, eta: f64| {
         crossings(&at, folder, world, eta).map_err(|error| failure(format!("{error:#}")))
     });
+    let at = root.clone();
     environment.add_function("commits", move |folder: &str| {
-        commits(&root, folder).map_err(|error| failure(format!("{error:#}")))
+        commits(&at, folder).map_err(|error| failure(format!("{error:#}")))
+    });
+    environment.add_filter("difficulty", move |scene: &str| {
+        difficulty(&root, scene).map_err(|error| failure(format!("{error:#}")))
     });
     environment.add_filter("where", |rows: Vec<Row>, key: &str, value: Value| -> Vec<Row> {
         rows.into_iter().filter(|row| field(row, key).as_ref() == Some(&value)).collect()
@@ -220,6 +224,15 @@ fn environment(repository: &Path) -> Environment<'static> {
 
 fn failure(what: impl Into<String>) -> Error {
     Error::new(ErrorKind::InvalidOperation, what.into())
+}
+
+/// What makes a scene hard, by its file.
+fn difficulty(repository: &Path, scene: &str) -> Result<String> {
+    let path = repository.join(format!("configs/scenes/{scene}.toml"));
+    let text = fs::read_to_string(&path).with_context(|| path.display().to_string())?;
+    let scene: toml::Table = text.parse().with_context(|| path.display().to_string())?;
+    let difficulty = scene.get("difficulty").and_then(toml::Value::as_str);
+    Ok(difficulty.context("a scene of the suite has a difficulty")?.to_owned())
 }
 
 /// A number with so many decimals, without a minus before a zero.

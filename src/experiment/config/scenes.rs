@@ -4,6 +4,7 @@
 //!
 //! ```toml
 //! about = "What is special about it, in a sentence."
+//! difficulty = "route"            # what makes it hard, in a word or two; may be left out
 //! horizon = 60                    # constants that all worlds with such a key take
 //! map = """
 //! S..L.G
@@ -47,6 +48,7 @@ const SHIPPED: &[(&str, &str)] = &[
     shipped!("cliff-walk"),
     shipped!("island"),
     shipped!("chow-gap"),
+    shipped!("risky-point-mass"),
 ];
 
 /// A map and constants.
@@ -56,6 +58,8 @@ pub struct Scene {
     origin: String,
     /// What is special about it.
     pub about: String,
+    /// What makes it hard, in a word or two.
+    pub difficulty: Option<String>,
     /// Its map.
     pub map: Map,
     /// Constants for all worlds.
@@ -73,16 +77,19 @@ impl Scene {
         let mut table = layers::table(origin, text)?;
         let refused = |message: String| ConfigError::Syntax { origin: origin.to_owned(), message };
         let mut text_of = |key: &str| match table.remove(key) {
-            Some(Value::String(text)) => Ok(text),
+            Some(Value::String(text)) => Ok(Some(text)),
             Some(other) => {
                 Err(refused(format!("{key} = {} is no text", one_line(&other.to_string()))))
             }
-            None => Err(refused(format!("a scene needs the key {key}"))),
+            None => Ok(None),
         };
-        let (about, map) = (text_of("about")?, text_of("map")?);
+        let needed = |key: &str| refused(format!("a scene needs the key {key}"));
+        let about = text_of("about")?.ok_or_else(|| needed("about"))?;
+        let difficulty = text_of("difficulty")?;
+        let map = text_of("map")?.ok_or_else(|| needed("map"))?;
         let map = Map::parse(&map).map_err(|error| refused(error.to_string()))?;
         let (own, common) = table.into_iter().partition(|(_, value)| value.is_table());
-        Ok(Scene { origin: origin.to_owned(), about, map, common, own })
+        Ok(Scene { origin: origin.to_owned(), about, difficulty, map, common, own })
     }
 
     /// Refuses keys that are a constant of no world.
