@@ -13,6 +13,9 @@ use crate::learn::inputs::{Rows, Selection};
 use pulp::{Arch, Simd, WithSimd};
 use std::hint::black_box;
 
+/// Hidden units at a time where each sample has its own column of W: their rows of a block fit into the first cache.
+const TOGETHER: usize = 128;
+
 /// Numbers that begin at a multiple of 64 bytes: a vector load then stays within one cache line.
 #[derive(Debug, Default)]
 struct Aligned(Vec<f32>);
@@ -283,10 +286,12 @@ fn hidden_layer<S: Simd>(
         combine(simd, weights, x, S::as_mut_simd_f32s(h).0, Finish::Tanh);
     } else {
         // What a cell adds to z is its column of W.
-        for (sample, &cell) in cells.iter().enumerate() {
-            let column = &columns[cell as usize * units + first..];
-            for (z, &weight) in h.chunks_exact_mut(SAMPLES).zip(column) {
-                z[sample] = weight;
+        for (some, z) in h.chunks_mut(TOGETHER * SAMPLES).enumerate() {
+            for (sample, &cell) in cells.iter().enumerate() {
+                let column = &columns[cell as usize * units + first + some * TOGETHER..];
+                for (z, &weight) in z.chunks_exact_mut(SAMPLES).zip(column) {
+                    z[sample] = weight;
+                }
             }
         }
         let h = S::as_mut_simd_f32s(h).0;
@@ -538,10 +543,12 @@ impl<S: Simd> Pass<'_, S> {
             correlate(simd, h, x, by_first);
         }
         // The gradient by the column of W that a cell selects is that by z.
-        for (sample, &cell) in cells.iter().enumerate() {
-            let column = &mut self.gradient[shape.first_at(0, cell as usize)..][..units];
-            for (sum, by_z) in column.iter_mut().zip(h.chunks_exact(SAMPLES)) {
-                *sum += by_z[sample];
+        for (some, by_z) in h.chunks(TOGETHER * SAMPLES).enumerate() {
+            for (sample, &cell) in cells.iter().enumerate() {
+                let column = &mut self.gradient[shape.first_at(some * TOGETHER, cell as usize)..];
+                for (sum, by_z) in column.iter_mut().zip(by_z.chunks_exact(SAMPLES)) {
+                    *sum += by_z[sample];
+                }
             }
         }
     }
