@@ -113,7 +113,8 @@ pub fn measure(repository: &Path, target: &Path) -> Result<()> {
 /// Budgets of the certificates on scenes.
 const ETAS: [u32; 3] = [1, 25, 100];
 
-/// Adds the certificates of lava-point on every scene to `configs/oracle.json`. Each is kept as soon as it is known.
+/// Adds the certificates of lava-point on every scene to `configs/oracle.json`, and the upper bounds to
+/// `configs/upper-bounds.json`. Each is kept as soon as it is known.
 pub fn certify(repository: &Path, target: &Path) -> Result<()> {
     let program = target.join("release").join("cvar-game");
     let cache = target.join("certificates");
@@ -145,24 +146,37 @@ pub fn certify(repository: &Path, target: &Path) -> Result<()> {
             );
         }
     }
-    let path = repository.join("configs").join("oracle.json");
-    // An entry on a line, as it is in a file of the cache.
-    let text = fs::read_to_string(&path)?;
-    let mut entries: Vec<String> = (text.lines().filter(|line| line.starts_with('{')))
-        .map(|line| line.trim_end_matches(',').to_owned())
-        .collect();
     let mut found: Vec<_> = match fs::read_dir(cache.join("cvar-game").join("oracle")) {
         Ok(files) => files.map(|file| Ok(file?.path())).collect::<Result<_>>()?,
         Err(_) => Vec::new(),
     };
     found.sort();
-    for file in found {
-        let entry = fs::read_to_string(file)?.trim().to_owned();
+    let found = found.iter().map(|file| Ok(fs::read_to_string(file)?.trim().to_owned()));
+    let is_bound = |entry: &String| -> Result<bool> {
+        let entry: Value = serde_json::from_str(entry)?;
+        Ok(entry["certified"].get("shortfalls").is_some())
+    };
+    let (mut certificates, mut bounds) = (Vec::new(), Vec::new());
+    for entry in found.collect::<Result<Vec<_>>>()? {
+        if is_bound(&entry)? { bounds.push(entry) } else { certificates.push(entry) }
+    }
+    let configs = repository.join("configs");
+    add(&configs.join("oracle.json"), certificates)?;
+    add(&configs.join("upper-bounds.json"), bounds)
+}
+
+/// Adds entries to a file that has one on each line, as the files of the cache have them.
+fn add(path: &Path, found: Vec<String>) -> Result<()> {
+    let text = fs::read_to_string(path).with_context(|| path.display().to_string())?;
+    let mut entries: Vec<String> = (text.lines().filter(|line| line.starts_with('{')))
+        .map(|line| line.trim_end_matches(',').to_owned())
+        .collect();
+    for entry in found {
         if !entries.contains(&entry) {
             entries.push(entry);
         }
     }
-    fs::write(&path, format!("[\n{}\n]\n", entries.join(",\n")))
+    fs::write(path, format!("[\n{}\n]\n", entries.join(",\n")))
         .with_context(|| format!("{} cannot be written", path.display()))
 }
 
