@@ -11,6 +11,7 @@ use crate::report::group::{ALPHAS, Measures};
 use crate::report::records::{Records, Update};
 use plotters::prelude::*;
 use plotters::style::text_anchor::{HPos, VPos};
+use std::collections::BTreeSet;
 
 /// Points of a learning curve: a rollout by itself is too noisy to be read.
 const BINS: usize = 60;
@@ -64,9 +65,7 @@ pub struct Line {
 /// Lines in one chart, each the mean of its seeds in a band of the lowest and the highest one, and a dashed one.
 /// `None` if there is nothing to be drawn.
 pub fn lines(lines: &[Line], dashed: &[(f64, f64)], titles: (&str, &str)) -> Option<Picture> {
-    let names: Vec<String> = lines.iter().map(|line| line.title.clone()).collect();
-    let found: Vec<Vec<Band>> = lines.iter().map(|line| over_seeds(&line.seeds)).collect();
-    named_bands(&names, &found, titles, &[], dashed)
+    one_chart(lines, &[], titles, dashed)
 }
 
 /// The same with a dashed line of each line's colour.
@@ -75,67 +74,171 @@ pub(super) fn named_lines(
     dashed: &[Vec<(f64, f64)>],
     titles: (&str, &str),
 ) -> Option<Picture> {
-    let names: Vec<String> = lines.iter().map(|line| line.title.clone()).collect();
-    let found: Vec<Vec<Band>> = lines.iter().map(|line| over_seeds(&line.seeds)).collect();
-    named_bands(&names, &found, titles, dashed, &[])
+    one_chart(lines, dashed, titles, &[])
 }
 
-/// Bands in one chart, one for each row.
-fn bands(
-    panels: &[Panel],
-    bands: &[Vec<Band>],
+fn one_chart(
+    lines: &[Line],
+    dashed: &[Vec<(f64, f64)>],
     titles: (&str, &str),
-    dashed: &[Vec<(f64, f64)>],
-) -> Option<Picture> {
-    let names: Vec<String> = panels.iter().map(|panel| panel.group.title()).collect();
-    named_bands(&names, bands, titles, dashed, &[])
-}
-
-/// The same for any rows. A row's dashed line has its colour; `limit` is one of no row.
-fn named_bands(
-    names: &[String],
-    bands: &[Vec<Band>],
-    (x_title, y_title): (&str, &str),
-    dashed: &[Vec<(f64, f64)>],
     limit: &[(f64, f64)],
 ) -> Option<Picture> {
-    if bands.iter().all(Vec::is_empty) {
+    let mut facet = Facet { title: String::new(), curves: Vec::new() };
+    let mut words = Vec::new();
+    for (place, line) in lines.iter().enumerate() {
+        let (colour, band) = (colour(place), over_seeds(&line.seeds));
+        if !band.is_empty() {
+            words.push((line.title.clone(), colour));
+        }
+        let dashed = dashed.get(place).cloned().unwrap_or_default();
+        facet.curves.push(Curve { colour, band, dashed });
+    }
+    charts(words, &[facet], titles, limit)
+}
+
+/// Rows with something to be drawn. Several methods have a chart for each budget, and a method one colour in all charts.
+struct ByBudget {
+    methods: Vec<String>,
+    etas: Vec<f64>,
+    words: Vec<(String, RGBColor)>,
+}
+
+impl ByBudget {
+    /// `has` says which panels are drawn.
+    fn new(panels: &[Panel], has: impl Fn(usize) -> bool) -> ByBudget {
+        let mut methods: Vec<String> = panels.iter().map(ByBudget::method).collect();
+        let mut known = BTreeSet::new();
+        methods.retain(|method| known.insert(method.clone()));
+        let mut rows = ByBudget { methods, etas: Vec::new(), words: Vec::new() };
+        for (place, panel) in panels.iter().enumerate().filter(|(place, _)| has(*place)) {
+            let title = if rows.several() { ByBudget::method(panel) } else { panel.group.title() };
+            let word = (title, rows.colour(place, panel));
+            if !rows.words.contains(&word) {
+                rows.words.push(word);
+            }
+            rows.etas.push(panel.group.eta);
+        }
+        rows.etas.sort_by(f64::total_cmp);
+        rows.etas.dedup();
+        rows
+    }
+
+    fn method(panel: &Panel) -> String {
+        panel.group.method.clone().unwrap_or_default()
+    }
+
+    fn several(&self) -> bool {
+        self.methods.len() > 1
+    }
+
+    /// The colour of the panel in this place.
+    fn colour(&self, place: usize, panel: &Panel) -> RGBColor {
+        let method = self.methods.iter().position(|of| *of == ByBudget::method(panel));
+        colour(method.filter(|_| self.several()).unwrap_or(place))
+    }
+
+    fn title(eta: f64) -> String {
+        format!("eta = {eta}")
+    }
+}
+
+/// A row's line in its band, and a dashed one of the same colour.
+struct Curve {
+    colour: RGBColor,
+    band: Vec<Band>,
+    dashed: Vec<(f64, f64)>,
+}
+
+/// A chart of curves beside others on the same axes.
+struct Facet {
+    title: String,
+    curves: Vec<Curve>,
+}
+
+/// With more curves than this a chart leaves their bands out, which would hide each other.
+const MOST_BANDS: usize = 5;
+
+const LINES_AND_BANDS: &str =
+    "Line: mean over seeds; band, in charts of at most five lines: lowest and highest seed.";
+
+/// A curve for each row: in one chart those of one method, in a chart for each budget those of several.
+fn of_rows(
+    panels: &[Panel],
+    bands: Vec<Vec<Band>>,
+    titles: (&str, &str),
+    dashed: Vec<Vec<(f64, f64)>>,
+) -> Option<Picture> {
+    let rows = ByBudget::new(panels, |place| !bands[place].is_empty());
+    let mut facets: Vec<Facet> = if rows.several() {
+        let facet = |&eta: &f64| Facet { title: ByBudget::title(eta), curves: Vec::new() };
+        rows.etas.iter().map(facet).collect()
+    } else {
+        vec![Facet { title: String::new(), curves: Vec::new() }]
+    };
+    let dashed = dashed.into_iter().chain(std::iter::repeat_with(Vec::new));
+    for (place, ((panel, band), dashed)) in panels.iter().zip(bands).zip(dashed).enumerate() {
+        if band.is_empty() {
+            continue;
+        }
+        let facet = rows.etas.iter().position(|eta| rows.several() && *eta == panel.group.eta);
+        let colour = rows.colour(place, panel);
+        facets[facet.unwrap_or_default()].curves.push(Curve { colour, band, dashed });
+    }
+    charts(rows.words, &facets, titles, &[])
+}
+
+/// Charts side by side. `limit` is a dashed line of no row.
+fn charts(
+    mut words: Vec<(String, RGBColor)>,
+    facets: &[Facet],
+    (x_title, y_title): (&str, &str),
+    limit: &[(f64, f64)],
+) -> Option<Picture> {
+    let curves = || facets.iter().flat_map(|facet| &facet.curves);
+    if curves().all(|curve| curve.band.is_empty()) {
         return None;
     }
-    let all = || bands.iter().flatten();
-    let others = || dashed.iter().flatten().chain(limit);
+    let banded = |facet: &Facet| facet.curves.len() <= MOST_BANDS;
+    let all = || curves().flat_map(|curve| &curve.band);
+    let others = || curves().flat_map(|curve| &curve.dashed).chain(limit);
     let x = span(all().map(|band| band.x).chain(others().map(|(x, _)| *x)))?;
-    let ends = all().flat_map(|band| [band.low, band.high]);
-    let y = span(ends.chain(others().map(|(_, y)| *y)))?;
-    let mut words: Vec<_> = (names.iter().enumerate().zip(bands))
-        .filter(|(_, band)| !band.is_empty())
-        .map(|((place, name), _)| (name.clone(), colour(place)))
-        .collect();
+    let reach = |facet: &Facet| -> Vec<f64> {
+        let bands = facet.curves.iter().flat_map(|curve| &curve.band);
+        let ends = |band: &Band| {
+            if banded(facet) { [band.low, band.high] } else { [band.middle; 2] }
+        };
+        bands.flat_map(ends).collect()
+    };
+    let y = span(facets.iter().flat_map(reach).chain(others().map(|(_, y)| *y)))?;
     if !limit.is_empty() {
         words.push(("optimum".to_owned(), INK));
     }
-    let (width, height) = (1380, 714);
+    let (width, height) = if facets.len() > 1 { (690, 674) } else { (1380, 714) };
+    let width = width * facets.len() as u32;
     let legend = Legend::new(words, width);
     figure((width, legend.height + height), |canvas| {
         let (top, below) = canvas.split_vertically(legend.height);
         legend.draw(&top)?;
-        let mut chart = chart(&below, "", Axes { x, y, x_title, y_title })?;
-        for (place, band) in bands.iter().enumerate() {
-            let outline = band.iter().map(|band| (band.x, band.high));
-            let back = band.iter().rev().map(|band| (band.x, band.low));
-            let area: Vec<(f64, f64)> = outline.chain(back).collect();
-            chart.draw_series(std::iter::once(Polygon::new(area, colour(place).mix(0.18))))?;
+        for (area, facet) in below.split_evenly((1, facets.len())).iter().zip(facets) {
+            let axes = Axes { x: x.clone(), y: y.clone(), x_title, y_title };
+            let mut chart = chart(area, &facet.title, axes)?;
+            for Curve { colour, band, .. } in facet.curves.iter().filter(|_| banded(facet)) {
+                let outline = band.iter().map(|band| (band.x, band.high));
+                let back = band.iter().rev().map(|band| (band.x, band.low));
+                let area: Vec<(f64, f64)> = outline.chain(back).collect();
+                chart.draw_series(std::iter::once(Polygon::new(area, colour.mix(0.18))))?;
+            }
+            for Curve { colour, band, .. } in &facet.curves {
+                let line = band.iter().map(|band| (band.x, band.middle));
+                chart.draw_series(LineSeries::new(line, colour.stroke_width(4)))?;
+            }
+            for Curve { colour, dashed, .. } in &facet.curves {
+                let style = colour.stroke_width(4);
+                chart.draw_series(DashedLineSeries::new(dashed.iter().copied(), 10, 8, style))?;
+            }
+            let (line, style) = (limit.iter().copied(), INK.stroke_width(4));
+            chart.draw_series(DashedLineSeries::new(line, 10, 8, style))?;
         }
-        for (place, band) in bands.iter().enumerate() {
-            let line = band.iter().map(|band| (band.x, band.middle));
-            chart.draw_series(LineSeries::new(line, colour(place).stroke_width(4)))?;
-        }
-        for (place, line) in dashed.iter().enumerate() {
-            let style = colour(place).stroke_width(4);
-            chart.draw_series(DashedLineSeries::new(line.iter().copied(), 10, 8, style))?;
-        }
-        let (line, style) = (limit.iter().copied(), INK.stroke_width(4));
-        chart.draw_series(DashedLineSeries::new(line, 10, 8, style))?;
         Ok(())
     })
 }
@@ -154,66 +257,66 @@ pub(super) fn learning(panels: &[Panel]) -> Option<(Picture, String)> {
     };
     let found: Vec<Vec<Band>> =
         panels.iter().map(|panel| over_seeds(&of_seeds(panel, points))).collect();
-    let svg = bands(panels, &found, ("environment steps", "return in training"), &[])?;
+    let svg = of_rows(panels, found, ("environment steps", "return in training"), Vec::new())?;
     let caption = "Mean undiscounted return of the episodes that ended in a rollout, the sampled protagonist \
                    against its antagonist: so at eta above 1 it is not the nominal return, and it falls \
-                   as the budget rises. Line: mean over seeds; band: lowest and highest seed.";
-    Some((svg, caption.to_owned()))
+                   as the budget rises.";
+    Some((svg, format!("{caption} {}", LINES_AND_BANDS)))
 }
 
 pub(super) fn regret(panels: &[Panel]) -> Option<(Picture, String)> {
     let point = |update: &Update| Some((update.steps, update.regret?));
     let points = |records: &Records| records.progress.iter().filter_map(point).collect();
-    let found: Vec<Vec<Band>> =
-        panels.iter().map(|panel| over_seeds(&of_seeds(panel, points))).collect();
-    let svg = bands(panels, &found, ("environment steps", "regret"), &[])?;
+    let band = |of: Band| Band {
+        x: of.x,
+        low: place(of.low),
+        middle: place(of.middle),
+        high: place(of.high),
+    };
+    let found: Vec<Vec<Band>> = (panels.iter())
+        .map(|panel| over_seeds(&of_seeds(panel, points)).into_iter().map(band).collect())
+        .collect();
+    let svg = of_rows(panels, found, ("environment steps", "log10 of regret"), Vec::new())?;
     let caption = "The best CVaR_1/eta that is known minus that of the greedy protagonist as it is after so many \
                    steps (at eta = 1 the best mean minus its mean): exact in finite worlds, else of a few thousand \
-                   episodes. Line: mean over seeds; band: lowest and highest seed.";
-    Some((svg, caption.to_owned()))
+                   episodes.";
+    Some((
+        svg,
+        format!("{caption} Regrets below {LEAST_REGRET} are drawn there. {}", LINES_AND_BANDS),
+    ))
 }
 
 /// Regrets of at most this are drawn as this.
 pub(super) const LEAST_REGRET: f64 = 1e-3;
 
+/// Where a regret is drawn.
+fn place(regret: f64) -> f64 {
+    regret.max(LEAST_REGRET).log10()
+}
+
 /// The performance profile: the share of runs whose regret is at most so much (Agarwal and others, NeurIPS 2021). A run
 /// without a result never is among them.
 pub(super) fn profile(panels: &[Panel]) -> Option<(Picture, String)> {
-    let place = |regret: &f64| regret.max(LEAST_REGRET).log10();
     let found: Vec<Vec<f64>> = (panels.iter())
         .map(|panel| {
             let regrets = panel.group.measures.iter().filter_map(|of| of.regret);
-            let mut places: Vec<f64> = regrets.map(|regret| place(&regret)).collect();
+            let mut places: Vec<f64> = regrets.map(place).collect();
             places.sort_by(f64::total_cmp);
             places
         })
         .collect();
-    let mut etas: Vec<f64> = (panels.iter().zip(&found))
-        .filter(|(_, places)| !places.is_empty())
-        .map(|(panel, _)| panel.group.eta)
-        .collect();
-    etas.sort_by(f64::total_cmp);
-    etas.dedup();
+    let rows = ByBudget::new(panels, |place| !found[place].is_empty());
     let x = span(found.iter().flatten().copied().chain([LEAST_REGRET.log10()]))?;
-    // The rows of one method have one colour in all charts.
-    let name = |panel: &Panel| panel.group.method.clone().unwrap_or_else(|| "all runs".to_owned());
-    let mut names: Vec<String> = Vec::new();
-    for panel in panels {
-        if !names.contains(&name(panel)) {
-            names.push(name(panel));
-        }
-    }
-    let words = names.iter().enumerate().map(|(i, name)| (name.clone(), colour(i)));
-    let width = 690 * etas.len().max(1) as u32;
-    let legend = Legend::new(if names.len() > 1 { words.collect() } else { Vec::new() }, width);
+    let width = 690 * rows.etas.len().max(1) as u32;
+    let legend = Legend::new(if rows.several() { rows.words.clone() } else { Vec::new() }, width);
     let svg = figure((width, legend.height + 674), |canvas| {
         let (top, below) = canvas.split_vertically(legend.height);
         legend.draw(&top)?;
-        for (area, &eta) in below.split_evenly((1, etas.len())).iter().zip(&etas) {
+        for (area, &eta) in below.split_evenly((1, rows.etas.len())).iter().zip(&rows.etas) {
             let (x_title, y_title) = ("log10 of regret", "share of runs");
             let axes = Axes { x: x.clone(), y: 0.0..1.02, x_title, y_title };
-            let mut chart = chart(area, &format!("eta = {eta}"), axes)?;
-            for (panel, places) in panels.iter().zip(&found) {
+            let mut chart = chart(area, &ByBudget::title(eta), axes)?;
+            for (place, (panel, places)) in panels.iter().zip(&found).enumerate() {
                 if panel.group.eta != eta || places.is_empty() {
                     continue;
                 }
@@ -223,8 +326,10 @@ pub(super) fn profile(panels: &[Panel]) -> Option<(Picture, String)> {
                 let steps = places.iter().enumerate().flat_map(step);
                 let ends = [(x.start, 0.0), (x.end, places.len() as f64 / runs)];
                 let line = ends[..1].iter().copied().chain(steps).chain(ends[1..].iter().copied());
-                let method = names.iter().position(|of| *of == name(panel)).unwrap_or_default();
-                chart.draw_series(LineSeries::new(line, colour(method).stroke_width(4)))?;
+                chart.draw_series(LineSeries::new(
+                    line,
+                    rows.colour(place, panel).stroke_width(4),
+                ))?;
             }
         }
         Ok(())
@@ -310,12 +415,13 @@ pub(super) fn budget(panels: &[Panel]) -> Option<(Picture, String)> {
         let bands = over_seeds(&budgets.collect::<Vec<_>>());
         exact.push(bands.iter().map(|band| (band.x, band.middle)).collect());
     }
-    let svg = bands(panels, &found, ("time t (steps)", "log eta_t / log eta"), &exact)?;
+    let has_exact = exact.iter().any(|line: &Vec<(f64, f64)>| !line.is_empty());
+    let svg = of_rows(panels, found, ("time t (steps)", "log eta_t / log eta"), exact)?;
     let mut caption = "Remaining budget of the episodes that still run at time t, greedy protagonist against \
                        its learned antagonist: 1 is all of it, 0 none. Line: mean over trajectories, then \
                        seeds; band: 10 % and 90 % quantiles."
         .to_owned();
-    if exact.iter().any(|line| !line.is_empty()) {
+    if has_exact {
         caption += " Dashed: the exact worst-case antagonist, in expectation.";
     }
     Some((svg, caption))
@@ -342,17 +448,23 @@ pub(super) fn frontier(
         points.filter(|(x, y)| drawable(*x) && drawable(*y)).collect()
     };
     let curves: Vec<Vec<(f64, f64)>> = levels.iter().map(curve).collect();
-    let dots: Vec<Vec<(usize, f64, f64)>> = (levels.iter())
+    let rows = ByBudget::new(panels, |_| true);
+    let several = rows.several();
+    // Of several methods, at each level the rows that were trained for it.
+    let shown = |panel: &Panel, alpha| !several || panel.group.alpha() == alpha;
+    let dots: Vec<Vec<(RGBColor, f64, f64)>> = (levels.iter())
         .map(|&alpha| {
             let of_panel = |(place, panel): (usize, &Panel)| {
                 let level = panel.group.level(alpha);
+                let colour = rows.colour(place, panel);
                 let point = |measures: &Measures| {
                     let (x, y) = (measures.cvar[level]?, measures.mean?);
-                    (drawable(x) && drawable(y)).then_some((place, x, y))
+                    (drawable(x) && drawable(y)).then_some((colour, x, y))
                 };
                 panel.group.measures.iter().filter_map(point).collect::<Vec<_>>()
             };
-            panels.iter().enumerate().flat_map(of_panel).collect()
+            let panels = panels.iter().enumerate().filter(|(_, panel)| shown(panel, alpha));
+            panels.flat_map(of_panel).collect()
         })
         .collect();
     let points = || {
@@ -361,11 +473,14 @@ pub(super) fn frontier(
     };
     let (x, y) = (span(points().map(|(x, _)| x))?, span(points().map(|(_, y)| y))?);
     let width = 690 * levels.len().max(1) as u32;
-    let named = |(place, panel): (usize, &Panel)| {
-        let method = panel.group.method.as_ref().map_or(String::new(), |of| format!("{of} "));
-        (format!("{method}trained at eta = {}", panel.group.eta), colour(place))
+    let mut words = if several {
+        rows.words
+    } else {
+        let named = |(place, panel): (usize, &Panel)| {
+            (format!("trained at eta = {}", panel.group.eta), colour(place))
+        };
+        panels.iter().enumerate().map(named).collect()
     };
-    let mut words: Vec<_> = panels.iter().enumerate().map(named).collect();
     if optima.is_some() {
         words.push(("exact optima".to_owned(), INK));
     }
@@ -382,9 +497,8 @@ pub(super) fn frontier(
             chart.draw_series(LineSeries::new(curve.iter().copied(), INK.stroke_width(3)))?;
             chart.draw_series(curve.iter().map(|&point| Circle::new(point, 4, INK.filled())))?;
             chart.draw_series(
-                dots.iter().map(|&(place, x, y)| {
-                    Circle::new((x, y), 10, colour(place).mix(0.75).filled())
-                }),
+                (dots.iter())
+                    .map(|&(colour, x, y)| Circle::new((x, y), 10, colour.mix(0.75).filled())),
             )?;
         }
         Ok(())
@@ -392,6 +506,9 @@ pub(super) fn frontier(
     let mut caption = "A dot is the greedy protagonist of one seed under nominal chance: its mean return \
                        against the mean of its worst alpha-share of returns. Up and to the right is better."
         .to_owned();
+    if several {
+        caption += " A level has the rows that were trained for it.";
+    }
     if optima.is_some() {
         caption += &format!(
             " Black: the policies that are exactly optimal at budgets from 1 to {greatest}, each at \
