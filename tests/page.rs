@@ -212,7 +212,8 @@ fn figures_name_methods_and_variants() {
     let improvement =
         written.figures.drawn.iter().any(|figure| figure.name == "lava-point-improvement");
     assert!(!improvement, "it compares what was not in the same world");
-    assert!(svg("lava-point-learning").contains("mine, eta = 25"));
+    let learning = svg("lava-point-learning");
+    assert!(learning.contains("mine\n") && learning.contains("eta = 25\n"));
     assert!(!svg("lava-point-shifts").contains("mine"), "it has another world");
     let missing = "lava-point: maps of mine, eta = 25, whose constants are not those of the others";
     assert_eq!(written.figures.missing, [missing]);
