@@ -261,7 +261,7 @@ pub(super) fn learning(panels: &[Panel]) -> Option<(Picture, String)> {
     let caption = "Mean undiscounted return of the episodes that ended in a rollout, the sampled protagonist \
                    against its antagonist: so at eta above 1 it is not the nominal return, and it falls \
                    as the budget rises.";
-    Some((svg, format!("{caption} {}", LINES_AND_BANDS)))
+    Some((svg, format!("{caption} {LINES_AND_BANDS}")))
 }
 
 pub(super) fn regret(panels: &[Panel]) -> Option<(Picture, String)> {
@@ -282,7 +282,7 @@ pub(super) fn regret(panels: &[Panel]) -> Option<(Picture, String)> {
                    episodes.";
     Some((
         svg,
-        format!("{caption} Regrets below {LEAST_REGRET} are drawn there. {}", LINES_AND_BANDS),
+        format!("{caption} Regrets below {LEAST_REGRET} are drawn there. {LINES_AND_BANDS}"),
     ))
 }
 
