@@ -85,6 +85,31 @@ fn exact_solves_the_grid() {
     assert!(answer(&["exact", "--env", "lava-grid", "--eta", "1"]).contains("lava-grid"));
 }
 
+/// The weights that are committed are those of the rows that are committed.
+#[test]
+fn packed_players_are_played_without_unpacking() {
+    let folder = "results/paper";
+    let runs = fs::read_to_string(format!("{folder}/runs.csv")).unwrap();
+    let values = ["env", "eta", "seed", "greedy_cvar"].map(|name| column(&runs, name));
+    let mut checked = 0;
+    for (((env, eta), seed), cvar) in
+        values[0].iter().zip(&values[1]).zip(&values[2]).zip(&values[3])
+    {
+        if env == "lava-grid" && seed == "121" {
+            let run = format!("{folder}/{env}/game/eta-{eta}/seed-{seed}");
+            let json = answer(&["exact", "--policy", &run, "--json"]);
+            let json: serde_json::Value = serde_json::from_str(&json).unwrap();
+            let found = json["cvar"].as_f64().unwrap();
+            assert!((found - cvar.parse::<f64>().unwrap()).abs() < 1e-6, "{run}: {found}, {cvar}");
+            checked += 1;
+        }
+    }
+    assert_eq!(checked, 3);
+    let run = format!("{folder}/lava-grid/game/eta-25/seed-122");
+    let error = refusal(&["exact", "--policy", &run]);
+    assert!(error.contains("pack --weights all"), "{error}");
+}
+
 #[test]
 fn bad_input_is_refused_in_one_line_that_says_what_to_do() {
     let folder = tempfile::tempdir().unwrap();

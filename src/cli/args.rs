@@ -352,8 +352,8 @@ pub struct ShiftsArgs {
 
 /// Pack the records of a results folder into one archive, DIR/runs.zip.
 ///
-/// The archive holds what `table`, `figures`, `report` and `bench` read of finished runs, and they read it
-/// as if the folders of the runs were there. It is checked before the folders are removed.
+/// The archive holds what the other verbs read of finished runs, and they read it as if the folders of the
+/// runs were there. It is checked before the folders are removed.
 #[derive(Debug, Args)]
 pub struct PackArgs {
     /// Output folder of `bench` or `train`.

@@ -277,15 +277,13 @@ fn carry_out(
 
 /// The configuration of a finished run whose players can be used here.
 fn read_run(registry: &Registry, folder: &Path) -> Result<RunConfig> {
-    let path = folder.join("config.toml");
-    if !path.exists() {
+    let Some(run) = RunConfig::of_folder(folder, registry.catalogue())? else {
         bail!(
             "{} holds no run; give the folder of one, such as \
              results/quick/lava-grid/game/eta-25/seed-1",
             folder.display()
         );
-    }
-    let run = RunConfig::load(&path, registry.catalogue())?;
+    };
     if runner::read_evaluation(folder)?.is_none() {
         bail!(
             "the run in {} has not finished; continue it with the `bench` or `train` that began it",

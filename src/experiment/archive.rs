@@ -254,6 +254,22 @@ impl RunFiles {
     }
 }
 
+/// A file of the run whose folder is, or would be, `folder`, and its place, for messages: from the archive of the results folder
+/// above it if the run is packed there, or else from the folder, whatever its name. `None` if there is no such file.
+///
+/// # Errors
+/// If the file or the archive cannot be read.
+pub fn read_file(folder: &Path, file: &str) -> io::Result<(PathBuf, Option<Vec<u8>>)> {
+    if let Some(packed) = RunFiles::at(folder)?.filter(RunFiles::is_packed)
+        && let Some(bytes) = packed.read(file)?
+    {
+        return Ok((packed.place(file), Some(bytes)));
+    }
+    let place = folder.join(file);
+    let bytes = optional(read_at_most(&place, LARGEST_FILE))?;
+    Ok((place, bytes))
+}
+
 fn optional<T>(result: io::Result<T>) -> io::Result<Option<T>> {
     match result {
         Ok(found) => Ok(Some(found)),

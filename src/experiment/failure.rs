@@ -43,6 +43,11 @@ pub enum RunError {
     /// The weights are not those of the run.
     #[error("final.safetensors does not fit the run: {0}")]
     Weights(#[from] WeightsError),
+    /// The weights were not kept.
+    #[error(
+        "{0} is not there; `pack` keeps the weights of the first seed of each row, and `pack --weights all` those of all"
+    )]
+    NoWeights(String),
     /// A file could not be read or written.
     #[error("{path}: {source}")]
     File {

@@ -3,6 +3,7 @@
 //! A world or a method is one file and one line in [`standard`]. A program of your own lists its own
 //! with [`crate::registry!`] and hands them to [`crate::cli::main`]; see `examples/windy_corridor.rs`.
 
+use super::archive;
 use super::artefacts::{Chance, Play};
 use super::config::catalogue::MethodChecks;
 use super::config::{Catalogue, MethodInfo, RunConfig, WorldConstants, WorldInfo};
@@ -10,13 +11,12 @@ use super::evaluation::{self, Contestants};
 use super::failure::RunError;
 use super::names::{RunId, WorldName, base_of};
 use super::run;
-use super::runner::Report;
+use super::runner::{Report, WEIGHTS};
 use super::steps::{self, Format};
 use super::stop::Stop;
 use crate::exact::walk::Walk;
 use crate::exact::watch::Watch;
 use crate::exact::yardstick::{Answer, Options, Solvable, Source, Yardstick};
-use crate::files::{LARGEST_FILE, read_at_most};
 use crate::game::returns::ReturnLaw;
 use crate::learn::family::Perturbed;
 use crate::learn::method::{Arena, MethodEntry, Players};
@@ -312,10 +312,10 @@ impl<W: Arena> WorldEntry<W> {
     /// The trained players of the finished run in `folder`.
     ///
     /// # Errors
-    /// If the folder holds no weights of the run, or its method is none of this program.
+    /// If neither the folder nor the archive above it holds weights of the run, or its method is none of this program.
     pub fn load(&self, run: &RunConfig, folder: &Path) -> Result<Box<dyn Players<W>>, RunError> {
-        let path = folder.join("final.safetensors");
-        let bytes = read_at_most(&path, LARGEST_FILE).map_err(RunError::file(&path))?;
+        let (path, bytes) = archive::read_file(folder, WEIGHTS).map_err(RunError::file(folder))?;
+        let bytes = bytes.ok_or_else(|| RunError::NoWeights(path.display().to_string()))?;
         require_own(&weights::about(&bytes)?, &run.id()).map_err(RunError::file(&path))?;
         let world = W::new(&constants::<W>(&run.env)?, 1)?;
         let mut players = (self.method(run)?.players)(&world, &run.setting());

@@ -418,9 +418,9 @@ impl Opponent {
 }
 
 fn configuration(folder: &Path) -> PyResult<RunConfig> {
-    let path = folder.join("config.toml");
-    let run = RunConfig::load(&path, registry::standard().catalogue());
-    run.map_err(|error| invalid(error.to_string()))
+    let run = RunConfig::of_folder(folder, registry::standard().catalogue());
+    let run = run.map_err(|error| invalid(error.to_string()))?;
+    run.ok_or_else(|| invalid(format!("{} holds no run", folder.display())))
 }
 
 /// A policy compared with the best.

@@ -7,6 +7,7 @@ use super::{
     Catalogue, CheckpointOptions, ConfigError, EvaluationOptions, conflicts, of_run, printed,
     rules, typed,
 };
+use crate::experiment::archive;
 use crate::experiment::artefacts::SCHEMA;
 use crate::experiment::names::{MethodName, RunId, VariantName};
 use crate::game::budget::Eta;
@@ -15,6 +16,7 @@ use crate::learn::method;
 use crate::learn::options::{PlayerOptions, TrainOptions};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
+use std::io;
 use std::path::Path;
 use toml::{Table, Value};
 
@@ -138,6 +140,24 @@ impl RunConfig {
     pub fn load(path: &Path, catalogue: &Catalogue) -> Result<RunConfig, ConfigError> {
         let (origin, table) = layers::read(path)?;
         Self::checked(path, &origin, table, catalogue)
+    }
+
+    /// That of the run in `folder`, or packed in the archive of its results folder; `None` if there is no such run.
+    ///
+    /// # Errors
+    /// As [`RunConfig::load`].
+    pub fn of_folder(
+        folder: &Path,
+        catalogue: &Catalogue,
+    ) -> Result<Option<RunConfig>, ConfigError> {
+        let unreadable = |path: &Path, source| ConfigError::Read { path: path.to_owned(), source };
+        let (path, bytes) = archive::read_file(folder, "config.toml")
+            .map_err(|source| unreadable(folder, source))?;
+        let Some(bytes) = bytes else { return Ok(None) };
+        let text = String::from_utf8(bytes).map_err(|error| {
+            unreadable(&path, io::Error::new(io::ErrorKind::InvalidData, error))
+        })?;
+        Self::parse(&path, &text, catalogue).map(Some)
     }
 
     /// The same for a text, which is that of `path`.
