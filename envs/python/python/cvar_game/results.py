@@ -27,7 +27,8 @@ class Run:
     """A finished run of ``cvar-game bench`` or ``train``: its players.
 
     Args:
-        folder: The run's folder, with ``config.toml`` and ``final.safetensors``.
+        folder: The run's folder, with ``config.toml`` and ``final.safetensors``; of a packed run, the folder that it
+            had.
 
     Raises:
         ValueError: If it is no folder of a finished run.
